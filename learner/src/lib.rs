@@ -1,0 +1,7 @@
+//! Mazeway's learner: watches experts act and works out what they want.
+//!
+//! Learning flows one way: trajectory → store → statistics → fit → policy → report. The core ([`mdp`], [`trajectory`],
+//! [`statistics`], [`irl`], [`eval`]) knows no storage and no transport and compiles without the feature `service`.
+
+pub mod irl;
+pub mod trajectory;

@@ -1,0 +1,121 @@
+//! Demonstrations: what an expert was seen to do.
+//!
+//! Invariant: a [`Trajectory`] is never ragged or empty, and its indices lie within its process's sizes.
+
+use serde::{Deserialize, Serialize};
+
+/// Index of a state.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(transparent)]
+pub struct State(pub u32);
+
+/// Index of an action.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(transparent)]
+pub struct Action(pub u32);
+
+/// One demonstration: states before each step and the actions taken there. Shape (steps,) each.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Trajectory {
+    states: Vec<u32>,
+    actions: Vec<u32>,
+    final_state: Option<u32>,
+}
+
+/// Why arrays are not a trajectory.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum TrajectoryError {
+    /// No step.
+    #[error("expected at least one step, got none")]
+    Empty,
+    /// Lengths differ.
+    #[error("expected as many actions as states, got {states} states and {actions} actions")]
+    Ragged {
+        /// Number of states.
+        states: usize,
+        /// Number of actions.
+        actions: usize,
+    },
+    /// A state outside the state set.
+    #[error("expected states below {n_states}, got {state} at step {step}")]
+    StateOutOfRange {
+        /// Position in the trajectory.
+        step: usize,
+        /// What came.
+        state: u32,
+        /// Size of the state set.
+        n_states: u32,
+    },
+    /// An action outside the action set.
+    #[error("expected actions below {n_actions}, got {action} at step {step}")]
+    ActionOutOfRange {
+        /// Position in the trajectory.
+        step: usize,
+        /// What came.
+        action: u32,
+        /// Size of the action set.
+        n_actions: u32,
+    },
+}
+
+impl Trajectory {
+    /// Checks and keeps a demonstration in a process of `n_states` states and `n_actions` actions.
+    ///
+    /// # Errors
+    /// Empty or ragged arrays, indices out of range.
+    pub fn new(
+        states: Vec<u32>,
+        actions: Vec<u32>,
+        final_state: Option<u32>,
+        n_states: u32,
+        n_actions: u32,
+    ) -> Result<Self, TrajectoryError> {
+        if states.len() != actions.len() {
+            return Err(TrajectoryError::Ragged { states: states.len(), actions: actions.len() });
+        }
+        if states.is_empty() {
+            return Err(TrajectoryError::Empty);
+        }
+        for (step, &state) in states.iter().chain(&final_state).enumerate() {
+            if state >= n_states {
+                return Err(TrajectoryError::StateOutOfRange { step, state, n_states });
+            }
+        }
+        if let Some((step, &action)) = actions.iter().enumerate().find(|&(_, &a)| a >= n_actions) {
+            return Err(TrajectoryError::ActionOutOfRange { step, action, n_actions });
+        }
+        Ok(Self { states, actions, final_state })
+    }
+
+    /// States before each step, shape (steps,).
+    pub fn states(&self) -> &[u32] {
+        &self.states
+    }
+
+    /// Actions, shape (steps,).
+    pub fn actions(&self) -> &[u32] {
+        &self.actions
+    }
+
+    /// State after the last step, where known.
+    pub fn final_state(&self) -> Option<u32> {
+        self.final_state
+    }
+
+    /// Number of steps, at least 1.
+    #[expect(clippy::len_without_is_empty, reason = "a trajectory is never empty")]
+    pub fn len(&self) -> usize {
+        self.states.len()
+    }
+
+    /// The first `horizon` steps; the whole trajectory where it is shorter.
+    #[must_use]
+    pub fn truncated(&self, horizon: usize) -> Self {
+        let n = horizon.clamp(1, self.len());
+        Self {
+            states: self.states[..n].to_vec(),
+            actions: self.actions[..n].to_vec(),
+            final_state: if n < self.len() { Some(self.states[n]) } else { self.final_state },
+        }
+    }
+}

@@ -4,4 +4,6 @@
 //! [`statistics`], [`irl`], [`eval`]) knows no storage and no transport and compiles without the feature `service`.
 
 pub mod irl;
+#[cfg(feature = "service")]
+pub mod report;
 pub mod trajectory;

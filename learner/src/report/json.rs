@@ -1,0 +1,112 @@
+//! The object that `--json` prints: one line, its keys in a fixed order, for programs.
+//!
+//! Invariant: every number is finite; what is not known or not finite is `null`, so that a strict parser reads it.
+
+use super::{DriverMetrics, Drivers, Interval, Report};
+use serde::{Serialize, Serializer};
+use std::path::Path;
+
+/// The object as text, without a final newline. `report` is the path of `report.html`.
+///
+/// Keys: `env, style, method, trajectories, horizon, drivers, agreement, states_covered, stopped, iterations, fit_secs,
+/// total_secs, report`; where no driver is rolled out (a maze) `expected_value_difference` stands in place of `drivers`.
+pub fn to_string(report: &Report, path: Option<&Path>) -> String {
+    serde_json::to_string(&Summary::new(report, path)).expect("plain structs of numbers and text serialise")
+}
+
+/// Order of the fields is the order of the keys.
+#[derive(Serialize)]
+struct Summary<'a> {
+    env: &'a str,
+    style: &'a str,
+    method: &'a str,
+    trajectories: u64,
+    horizon: u32,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    drivers: Option<Option<DriversJson>>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    expected_value_difference: Option<Finite>,
+    agreement: Finite,
+    states_covered: u32,
+    stopped: crate::irl::Stopped,
+    iterations: u32,
+    fit_secs: Finite,
+    total_secs: Finite,
+    report: Option<String>,
+}
+
+impl<'a> Summary<'a> {
+    fn new(report: &'a Report, path: Option<&Path>) -> Self {
+        let driven = report.drivers.is_some() || report.is_highway();
+        Self {
+            env: &report.env_id,
+            style: &report.style,
+            method: &report.method,
+            trajectories: report.trajectories,
+            horizon: report.horizon,
+            drivers: driven.then(|| report.drivers.map(DriversJson::from)),
+            expected_value_difference: (!driven).then(|| Finite(report.expected_value_difference.unwrap_or(f64::NAN))),
+            agreement: Finite(report.agreement),
+            states_covered: report.states_covered,
+            stopped: report.stopped,
+            iterations: report.iterations,
+            fit_secs: Finite(report.fit_secs),
+            total_secs: Finite(report.total_secs),
+            report: path.map(|path| path.display().to_string()),
+        }
+    }
+}
+
+#[derive(Serialize)]
+struct DriversJson {
+    expert: Option<MetricsJson>,
+    learned: MetricsJson,
+    random: MetricsJson,
+}
+
+impl From<Drivers> for DriversJson {
+    fn from(drivers: Drivers) -> Self {
+        Self { expert: drivers.expert.map(Into::into), learned: drivers.learned.into(), random: drivers.random.into() }
+    }
+}
+
+#[derive(Serialize)]
+struct MetricsJson {
+    speed_mps: IntervalJson,
+    collisions: IntervalJson,
+    overtakes_left: IntervalJson,
+    overtakes_right: IntervalJson,
+}
+
+impl From<DriverMetrics> for MetricsJson {
+    fn from(metrics: DriverMetrics) -> Self {
+        Self {
+            speed_mps: metrics.speed_mps.into(),
+            collisions: metrics.collisions.into(),
+            overtakes_left: metrics.overtakes_left.into(),
+            overtakes_right: metrics.overtakes_right.into(),
+        }
+    }
+}
+
+#[derive(Serialize)]
+struct IntervalJson {
+    mean: Finite,
+    low: Finite,
+    high: Finite,
+}
+
+impl From<Interval> for IntervalJson {
+    fn from(interval: Interval) -> Self {
+        Self { mean: Finite(interval.mean), low: Finite(interval.low), high: Finite(interval.high) }
+    }
+}
+
+/// A number, or `null` where it is none.
+struct Finite(f64);
+
+impl Serialize for Finite {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        if self.0.is_finite() { serializer.serialize_f64(self.0) } else { serializer.serialize_none() }
+    }
+}

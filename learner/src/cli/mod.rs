@@ -1,0 +1,67 @@
+//! The command line: arguments are parsed into flags, flags into a job that is checked without I/O, and the job is run.
+//!
+//! Invariants: results go to standard output, everything else to standard error; a failure is one `error:` line and one
+//! `hint:` line; a closed pipe ends the program quietly.
+
+pub mod error;
+pub mod fit;
+
+use clap::{Args, Parser, Subcommand};
+use error::CliError;
+use std::{path::PathBuf, process::ExitCode};
+use tracing_subscriber::EnvFilter;
+
+/// Watches experts act and works out what they want.
+#[derive(Debug, Parser)]
+#[command(name = "learner", version, about, propagate_version = true, disable_help_subcommand = true)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    /// Learn a reward and a policy from demonstrations, and report what was learned
+    Fit(fit::FitArgs),
+}
+
+/// Which recordings and fits a command works on.
+#[derive(Debug, Clone, Default, Args)]
+pub struct StoreArgs {
+    /// Directory of the recordings, models and fits [default: the platform's data directory]
+    #[arg(long, value_name = "DIR", env = "MAZEWAY_DATA")]
+    pub data: Option<PathBuf>,
+    /// Address of a running learner service, such as 127.0.0.1:50052, instead of one started for this command
+    #[arg(long, value_name = "HOST:PORT", conflicts_with = "data")]
+    pub addr: Option<String>,
+}
+
+/// Parses the arguments, runs the command and says how it went.
+pub fn main() -> ExitCode {
+    let cli = match Cli::try_parse() {
+        Ok(cli) => cli,
+        Err(error) => return error::report_usage(&error),
+    };
+    let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("error"));
+    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
+    let runtime = match tokio::runtime::Builder::new_multi_thread().enable_all().build() {
+        Ok(runtime) => runtime,
+        Err(error) => {
+            return CliError::failure(
+                format!("could not start the runtime: {error}"),
+                "check the limits on threads and open files (ulimit -a)",
+            )
+            .report();
+        }
+    };
+    match runtime.block_on(run(cli.command)) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => error.report(),
+    }
+}
+
+async fn run(command: Command) -> Result<(), CliError> {
+    match command {
+        Command::Fit(args) => fit::run(args).await,
+    }
+}

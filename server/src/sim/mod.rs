@@ -3,6 +3,12 @@
 //! Invariants: the same seed gives the same numbers on every platform and release; a step neither allocates nor locks.
 //! Deliberately absent: time limits, autoreset and batching, which the batch above adds alike for every simulator.
 
+mod drivers;
+pub mod maze;
+pub mod model;
+mod options;
+pub mod rng;
+
 use std::sync::Arc;
 
 /// The random generator of one environment: PCG XSL RR 128/64, a named and portable algorithm.
@@ -189,17 +195,17 @@ pub struct TabularModel {
     pub state_labels: Vec<String>,
     /// Label of each action.
     pub action_labels: Vec<String>,
-    /// p(s₁), shape (n_states,).
+    /// p(s₁), shape `(n_states,)`.
     pub initial_distribution: Vec<f64>,
-    /// Start of each row's entries, shape (n_states * n_actions + 1,).
+    /// Start of each row's entries, shape `(n_states * n_actions + 1,)`.
     pub row_offsets: Vec<usize>,
     /// Next state of each entry, rising within a row.
     pub next_states: Vec<u32>,
     /// Probability of each entry; each row sums to 1.
     pub probabilities: Vec<f64>,
-    /// Visits from which each row was estimated, shape (n_states * n_actions,); `None` where exact.
+    /// Visits from which each row was estimated, shape `(n_states * n_actions,)`; `None` where exact.
     pub visit_counts: Option<Vec<u64>>,
-    /// R(s,a) of each style, shape (n_states, n_actions).
+    /// R(s,a) of each style, shape `(n_states, n_actions)`.
     pub rewards: Vec<(String, Vec<f64>)>,
     /// Grid rows, grid columns and each state's row-major cell, where the environment lies on a grid.
     pub grid: Option<(u32, u32, Vec<u32>)>,
@@ -212,4 +218,11 @@ pub struct Configured<S> {
     pub spec: Arc<EnvSpec>,
     /// A simulator that was never reset, to clone.
     pub prototype: S,
+}
+
+/// Every environment with its default options, in alphabetical order of `env_id`.
+pub fn catalogue() -> Vec<EnvSpec> {
+    let none = serde_json::Map::new();
+    let specs = [maze::configure(&none).map(|c| c.spec)];
+    specs.into_iter().map(|spec| Arc::unwrap_or_clone(spec.expect("defaults are valid options"))).collect()
 }

@@ -7,3 +7,6 @@ pub mod irl;
 #[cfg(feature = "service")]
 pub mod report;
 pub mod trajectory;
+
+#[cfg(feature = "service")]
+pub mod store;

@@ -1,0 +1,257 @@
+//! Durable trajectories, models and fits in one directory, in SQLite.
+//!
+//! Invariants: what was acknowledged is on stable storage and survives the death of the process and of the machine; an
+//! id means one content for ever; rows are read in the order in which they were recorded, in memory that does not grow
+//! with the data; several processes may use a directory at once. Trajectories are kept raw: what a method needs of them
+//! depends on the discount and the horizon, and is derived when it is needed.
+//!
+//! Deliberately absent: the wire (see [`crate::grpc`]), and any change of what is stored; there is recording and
+//! deleting.
+
+mod error;
+mod filter;
+mod fits;
+mod models;
+mod recording;
+mod schema;
+mod trajectories;
+mod writer;
+
+#[cfg(test)]
+mod tests;
+
+pub use error::StoreError;
+pub use filter::Filter;
+pub use fits::FitInfo;
+pub use models::{Model, ModelInfo, Rows, check_header};
+pub use recording::{
+    Arrays, Collection, FieldError, MAX_LABEL_BYTES, Recording, check_label, check_model_id, clip, pack_f64, pack_u32,
+    unpack_f64, unpack_u32,
+};
+pub use schema::FILE_NAME;
+pub use trajectories::{Cursor, TrajectorySummary};
+
+use mazeway_proto::learner as pb;
+use rusqlite::Connection;
+use std::{
+    ops::{ControlFlow, Deref},
+    path::{Path, PathBuf},
+    sync::{Arc, Mutex, PoisonError},
+    time::SystemTime,
+};
+use tokio::sync::Semaphore;
+use writer::Writer;
+
+/// Bytes of arrays that wait for the disk at most; more wait in their callers.
+const PENDING_BYTES: usize = 256 << 20;
+/// Unit in which pending bytes are counted.
+const PENDING_UNIT: usize = 1 << 10;
+/// Bytes of arrays that a reader holds at a time, one trajectory more at most.
+const PAGE_BYTES: usize = 1 << 20;
+/// Idle reading connections that are kept.
+const IDLE_READERS: usize = 8;
+
+/// A store, cheap to clone. Writing is asynchronous; reading blocks and belongs on a thread that may block. The last
+/// clone that goes waits until everything submitted is written.
+#[derive(Debug, Clone)]
+pub struct Store(Arc<Inner>);
+
+#[derive(Debug)]
+struct Inner {
+    path: PathBuf,
+    writer: Writer,
+    pending: Semaphore,
+    readers: Mutex<Vec<Connection>>,
+}
+
+impl Store {
+    /// Opens the store of a directory, made where it is missing. Blocks.
+    pub fn open(directory: &Path) -> Result<Self, StoreError> {
+        let (path, connection) = schema::open(directory)?;
+        let writer = Writer::start(connection, path.clone())?;
+        let pending = Semaphore::new(PENDING_BYTES / PENDING_UNIT);
+        Ok(Self(Arc::new(Inner { path, writer, pending, readers: Mutex::default() })))
+    }
+
+    /// The database file.
+    pub fn path(&self) -> &Path {
+        &self.0.path
+    }
+
+    /// Stores all of the trajectories or none. Returns how many were not stored before, once they are on stable storage.
+    ///
+    /// # Errors
+    /// [`StoreError::TrajectoryExists`] where an id is stored with another content.
+    pub async fn record(&self, recordings: Vec<Recording>) -> Result<u32, StoreError> {
+        let bytes = recordings.iter().map(Recording::packed_bytes).sum::<usize>();
+        let units = bytes.div_ceil(PENDING_UNIT).clamp(1, PENDING_BYTES / PENDING_UNIT);
+        let _pending = self.0.pending.acquire_many(units as u32).await.map_err(|_| StoreError::Closed)?;
+        let job = move |work: &mut writer::Work<'_>| {
+            let mut stored = 0;
+            for (index, recording) in recordings.iter().enumerate() {
+                let new = trajectories::insert(work.connection, work.path, work.collections, recording, index)?;
+                stored += u32::from(new);
+            }
+            Ok(stored)
+        };
+        self.0.writer.submit(job).await
+    }
+
+    /// Deletes what the filter selects and returns how many there were.
+    pub async fn delete_trajectories(&self, filter: Filter) -> Result<u64, StoreError> {
+        self.write(move |connection| trajectories::delete(connection, &filter)).await
+    }
+
+    /// Stores a model. `Ok(false)`: it is stored already.
+    pub async fn put_model(&self, model: Model) -> Result<bool, StoreError> {
+        self.write(move |connection| models::insert(connection, &model)).await
+    }
+
+    /// Stores a fit, whose id is set, and returns it with the time at which it was stored.
+    pub async fn put_fit(&self, mut fit: pb::Fit) -> Result<pb::Fit, StoreError> {
+        self.write(move |connection| {
+            let now = now_us();
+            fit.created_at = Some(timestamp(now));
+            fits::insert(connection, &fit, now)?;
+            Ok(fit)
+        })
+        .await
+    }
+
+    /// Deletes a fit by its whole id and says whether there was one.
+    pub async fn delete_fit(&self, fit_id: String) -> Result<bool, StoreError> {
+        self.write(move |connection| fits::delete(connection, &fit_id)).await
+    }
+
+    async fn write<T: Send + 'static>(
+        &self,
+        job: impl FnOnce(&Connection) -> rusqlite::Result<T> + Send + 'static,
+    ) -> Result<T, StoreError> {
+        let job =
+            move |work: &mut writer::Work<'_>| job(work.connection).map_err(|e| StoreError::from_sqlite(work.path, &e));
+        self.0.writer.submit(job).await
+    }
+
+    /// Reads on after the trajectory of rank `after`, 0 for the first, at most `limit`. Blocks.
+    pub fn summaries(&self, filter: &Filter, after: i64, limit: u32) -> Result<Vec<TrajectorySummary>, StoreError> {
+        trajectories::summaries(&*self.reader()?, self.path(), filter, after, limit)
+    }
+
+    /// How many trajectories the filter selects. Blocks.
+    pub fn count(&self, filter: &Filter) -> Result<u64, StoreError> {
+        self.read(|connection| trajectories::count(connection, filter))
+    }
+
+    /// Begins to read whole trajectories. Blocks.
+    pub fn cursor(&self, filter: &Filter) -> Result<Cursor, StoreError> {
+        self.read(|connection| Cursor::new(connection, filter))
+    }
+
+    /// The next trajectories; none at the end. Blocks.
+    pub fn next_page(&self, cursor: &mut Cursor) -> Result<Vec<Recording>, StoreError> {
+        next_page(&*self.reader()?, self.path(), cursor)
+    }
+
+    /// Calls `visit` with every trajectory that the filter selects, all as they stand at the first. Blocks.
+    pub fn for_each<B>(
+        &self,
+        filter: &Filter,
+        mut visit: impl FnMut(Recording) -> ControlFlow<B>,
+    ) -> Result<ControlFlow<B>, StoreError> {
+        let reader = self.reader()?;
+        let fail = |e: rusqlite::Error| StoreError::from_sqlite(self.path(), &e);
+        let snapshot = reader.unchecked_transaction().map_err(fail)?;
+        let mut cursor = Cursor::new(&snapshot, filter).map_err(fail)?;
+        loop {
+            let page = next_page(&snapshot, self.path(), &mut cursor)?;
+            if page.is_empty() {
+                return Ok(ControlFlow::Continue(()));
+            }
+            for recording in page {
+                if let ControlFlow::Break(value) = visit(recording) {
+                    return Ok(ControlFlow::Break(value));
+                }
+            }
+        }
+    }
+
+    /// Reads a model. Blocks.
+    pub fn model(&self, model_id: &str) -> Result<Option<Model>, StoreError> {
+        models::get(&*self.reader()?, self.path(), model_id)
+    }
+
+    /// Lists models in the order of their ids; an empty `env_id` means any. Blocks.
+    pub fn models(&self, env_id: &str) -> Result<Vec<ModelInfo>, StoreError> {
+        models::list(&*self.reader()?, self.path(), env_id)
+    }
+
+    /// Reads the fit whose id begins so. Blocks.
+    ///
+    /// # Errors
+    /// [`StoreError::AmbiguousFit`] where there are several.
+    pub fn fit(&self, prefix: &str) -> Result<Option<pb::Fit>, StoreError> {
+        fits::get(&*self.reader()?, self.path(), prefix)
+    }
+
+    /// Lists fits, newest first, from before the fit of rank `before` on; empty labels mean any. Blocks.
+    pub fn fits(&self, env_id: &str, style: &str, before: i64, limit: u32) -> Result<Vec<FitInfo>, StoreError> {
+        self.read(|connection| fits::list(connection, env_id, style, before, limit))
+    }
+
+    fn read<T>(&self, query: impl FnOnce(&Connection) -> rusqlite::Result<T>) -> Result<T, StoreError> {
+        query(&*self.reader()?).map_err(|e| StoreError::from_sqlite(self.path(), &e))
+    }
+
+    fn reader(&self) -> Result<Reader<'_>, StoreError> {
+        let idle = self.0.readers.lock().unwrap_or_else(PoisonError::into_inner).pop();
+        let connection = match idle {
+            Some(connection) => connection,
+            None => schema::open_reader(self.path())?,
+        };
+        Ok(Reader { connection: Some(connection), idle: &self.0.readers })
+    }
+}
+
+fn next_page(connection: &Connection, path: &Path, cursor: &mut Cursor) -> Result<Vec<Recording>, StoreError> {
+    // A page may be empty because its rows were deleted meanwhile: that is not the end.
+    while !cursor.is_done() {
+        let page = cursor.page(connection, path, PAGE_BYTES)?;
+        if !page.is_empty() {
+            return Ok(page);
+        }
+    }
+    Ok(Vec::new())
+}
+
+/// A reading connection, given back when dropped.
+struct Reader<'a> {
+    connection: Option<Connection>,
+    idle: &'a Mutex<Vec<Connection>>,
+}
+
+impl Deref for Reader<'_> {
+    type Target = Connection;
+
+    fn deref(&self) -> &Connection {
+        self.connection.as_ref().expect("a reader holds its connection until it is dropped")
+    }
+}
+
+impl Drop for Reader<'_> {
+    fn drop(&mut self) {
+        let mut idle = self.idle.lock().unwrap_or_else(PoisonError::into_inner);
+        if idle.len() < IDLE_READERS {
+            idle.extend(self.connection.take());
+        }
+    }
+}
+
+/// Microseconds since the Unix epoch.
+fn now_us() -> i64 {
+    SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).map_or(0, |d| d.as_micros() as i64)
+}
+
+/// A stored time on the wire.
+pub fn timestamp(us: i64) -> prost_types::Timestamp {
+    prost_types::Timestamp { seconds: us.div_euclid(1_000_000), nanos: (us.rem_euclid(1_000_000) * 1000) as i32 }
+}

@@ -1,0 +1,287 @@
+//! Tabular models in the store: checked, named by their content, kept packed as they came.
+//!
+//! Invariants of a [`Model`]: every row (s, a) is there once, its next states rise and lie within the sizes, its
+//! probabilities are positive and sum to 1; labels and rewards have the sizes that the header says; the id is the
+//! SHA-256 that `mazeway/env/v1/model.proto` lays down.
+
+use super::{
+    StoreError, now_us,
+    recording::{FieldError, check_label, clip, unpack_f64, unpack_u32},
+};
+use bytes::Bytes;
+use mazeway_proto::env::ModelHeader;
+use prost::Message as _;
+use rusqlite::{Connection, OptionalExtension, params};
+use sha2::{Digest, Sha256};
+use std::path::Path;
+
+/// Version of the header's encoding: a protocol buffer message behind this byte.
+const DOCUMENT_VERSION: u8 = 1;
+/// How far the sum of a row may lie from 1.
+const ROW_SUM_TOLERANCE: f64 = 1e-6;
+
+/// Rows of the transition function, packed as in `mazeway.env.v1.RowBlock`, all in one block.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct Rows {
+    /// Entries of each row, 32-bit integers, shape (`n_states * n_actions`,).
+    pub row_lengths: Bytes,
+    /// Next state of each entry, 32-bit integers.
+    pub next_states: Bytes,
+    /// Probability of each entry, doubles.
+    pub probabilities: Bytes,
+    /// Visits of each row, 64-bit integers; empty where the model is exact.
+    pub visit_counts: Bytes,
+}
+
+/// A tabular model, checked.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Model {
+    header: ModelHeader,
+    rows: Rows,
+}
+
+/// What is known of a model without its rows.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ModelInfo {
+    /// Everything but the rows.
+    pub header: ModelHeader,
+    /// Entries of the transition function.
+    pub n_transitions: u64,
+    /// When it was stored, in microseconds since the Unix epoch.
+    pub stored_at_us: i64,
+}
+
+impl Model {
+    /// Checks header and rows and names the model by its content.
+    ///
+    /// # Errors
+    /// The first field that breaks an invariant; a `model_id` that is given and is not that of the content.
+    pub fn new(mut header: ModelHeader, rows: Rows) -> Result<Self, FieldError> {
+        check_header(&header)?;
+        check_rows(&header, &rows)?;
+        let model_id = model_id(&header, &rows);
+        if !header.model_id.is_empty() && header.model_id != model_id {
+            let message = format!("expected {model_id} by the model's content, got {:?}", clip(&header.model_id));
+            return Err(FieldError::new("header.model_id", message));
+        }
+        header.model_id = model_id;
+        Ok(Self { header, rows })
+    }
+
+    /// Its id.
+    pub fn model_id(&self) -> &str {
+        &self.header.model_id
+    }
+
+    /// Everything but the rows.
+    pub fn header(&self) -> &ModelHeader {
+        &self.header
+    }
+
+    /// The rows.
+    pub fn rows(&self) -> &Rows {
+        &self.rows
+    }
+}
+
+/// Checks sizes, labels, start, rewards and grid.
+pub fn check_header(header: &ModelHeader) -> Result<(), FieldError> {
+    let field = |name: &str, message: String| Err(FieldError::new(format!("header.{name}"), message));
+    check_label("header.env_id", &header.env_id, false)?;
+    for (name, size) in [("n_states", header.n_states), ("n_actions", header.n_actions)] {
+        if size == 0 || size > i32::MAX as u32 {
+            return field(name, format!("expected 1 to {}, got {size}", i32::MAX));
+        }
+    }
+    let (n_states, n_actions) = (header.n_states as usize, header.n_actions as usize);
+    if n_states.checked_mul(n_actions).is_none_or(|rows| rows > u32::MAX as usize) {
+        return field("n_actions", format!("expected at most {} rows, got {n_states} times {n_actions}", u32::MAX));
+    }
+    for (name, labels, size) in
+        [("state_labels", &header.state_labels, n_states), ("action_labels", &header.action_labels, n_actions)]
+    {
+        if !labels.is_empty() && labels.len() != size {
+            return field(name, format!("expected {size} labels or none, got {}", labels.len()));
+        }
+    }
+    let start = &header.initial_distribution;
+    if !start.is_empty() {
+        if start.len() != n_states * 8 {
+            let (expected, got) = (n_states * 8, start.len());
+            return field("initial_distribution", format!("expected {expected} bytes or none, got {got}"));
+        }
+        if let Some((state, p)) = unpack_f64(start).enumerate().find(|(_, p)| !(0.0..=1.0).contains(p)) {
+            return field("initial_distribution", format!("expected probabilities, got {p} at state {state}"));
+        }
+        let sum = unpack_f64(start).sum::<f64>();
+        if (sum - 1.0).abs() > ROW_SUM_TOLERANCE {
+            return field("initial_distribution", format!("expected a sum of 1, got {sum}"));
+        }
+    }
+    for (i, table) in header.rewards.iter().enumerate() {
+        check_label(&format!("header.rewards[{i}].style"), &table.style, false)?;
+        if header.rewards[..i].iter().any(|other| other.style == table.style) {
+            return field(&format!("rewards[{i}].style"), format!("expected each style once, got {:?}", table.style));
+        }
+        let name = format!("rewards[{i}].values");
+        if table.values.len() != n_states * n_actions * 8 {
+            let (expected, got) = (n_states * n_actions * 8, table.values.len());
+            return field(&name, format!("expected {expected} bytes, got {got}"));
+        }
+        if let Some(value) = unpack_f64(&table.values).find(|value| !value.is_finite()) {
+            return field(&name, format!("expected finite rewards, got {value}"));
+        }
+    }
+    if let Some(grid) = &header.grid {
+        if grid.cells.len() != n_states * 4 {
+            let (expected, got) = (n_states * 4, grid.cells.len());
+            return field("grid.cells", format!("expected {expected} bytes, got {got}"));
+        }
+        let cells = u64::from(grid.rows) * u64::from(grid.columns);
+        if let Some(cell) = unpack_u32(&grid.cells).find(|&cell| u64::from(cell) >= cells) {
+            return field("grid.cells", format!("expected cells below {cells}, got {}", cell as i32));
+        }
+    }
+    Ok(())
+}
+
+fn check_rows(header: &ModelHeader, rows: &Rows) -> Result<(), FieldError> {
+    let field = |name: &str, message: String| Err(FieldError::new(format!("rows.{name}"), message));
+    let n_rows = header.n_states as usize * header.n_actions as usize;
+    if rows.row_lengths.len() != n_rows * 4 {
+        return field("row_lengths", format!("expected {n_rows} rows, got {}", rows.row_lengths.len() as f64 / 4.0));
+    }
+    let entries = unpack_u32(&rows.row_lengths).map(u64::from).sum::<u64>();
+    if rows.next_states.len() as u64 != entries * 4 {
+        return field("next_states", format!("expected {} bytes, got {}", entries * 4, rows.next_states.len()));
+    }
+    if rows.probabilities.len() as u64 != entries * 8 {
+        return field("probabilities", format!("expected {} bytes, got {}", entries * 8, rows.probabilities.len()));
+    }
+    if !rows.visit_counts.is_empty() && rows.visit_counts.len() != n_rows * 8 {
+        let got = rows.visit_counts.len();
+        return field("visit_counts", format!("expected {} bytes or none, got {got}", n_rows * 8));
+    }
+    let mut next_states = unpack_u32(&rows.next_states);
+    let mut probabilities = unpack_f64(&rows.probabilities);
+    for (row, length) in unpack_u32(&rows.row_lengths).enumerate() {
+        let at = || format!("at state {}, action {}", row / header.n_actions as usize, row % header.n_actions as usize);
+        let (mut before, mut sum) = (None, 0.0);
+        for (next, p) in next_states.by_ref().zip(probabilities.by_ref()).take(length as usize) {
+            if next >= header.n_states {
+                let message = format!("expected states below {}, got {} {}", header.n_states, next as i32, at());
+                return field("next_states", message);
+            }
+            if before.is_some_and(|before| before >= next) {
+                return field("next_states", format!("expected rising next states, got {next} out of order {}", at()));
+            }
+            if !(p > 0.0 && p <= 1.0 + ROW_SUM_TOLERANCE) {
+                return field("probabilities", format!("expected probabilities above 0, got {p} {}", at()));
+            }
+            before = Some(next);
+            sum += p;
+        }
+        if (sum - 1.0).abs() > ROW_SUM_TOLERANCE {
+            return field("probabilities", format!("expected a sum of 1, got {sum} {}", at()));
+        }
+    }
+    Ok(())
+}
+
+/// SHA-256 over sizes and rows, see `ModelHeader.model_id`.
+fn model_id(header: &ModelHeader, rows: &Rows) -> String {
+    let mut hash = Sha256::new();
+    hash.update(b"mazeway-model-v1");
+    hash.update(header.n_states.to_le_bytes());
+    hash.update(header.n_actions.to_le_bytes());
+    let mut entry = 0;
+    let mut bytes = Vec::new();
+    for length in unpack_u32(&rows.row_lengths) {
+        bytes.clear();
+        bytes.extend(length.to_le_bytes());
+        for _ in 0..length {
+            bytes.extend(&rows.next_states[entry * 4..entry * 4 + 4]);
+            bytes.extend(&rows.probabilities[entry * 8..entry * 8 + 8]);
+            entry += 1;
+        }
+        hash.update(&bytes);
+    }
+    hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+/// Stores a model. `Ok(false)`: it is stored already.
+pub(super) fn insert(connection: &Connection, model: &Model) -> rusqlite::Result<bool> {
+    let Model { header, rows } = model;
+    let mut document = vec![DOCUMENT_VERSION];
+    document.extend(header.encode_to_vec());
+    let inserted = connection.execute(
+        "INSERT INTO models (model_id, env_id, stored_at, n_transitions, header, row_lengths, next_states, \
+         probabilities, visit_counts) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?) ON CONFLICT (model_id) DO NOTHING",
+        params![
+            header.model_id,
+            header.env_id,
+            now_us(),
+            (rows.next_states.len() / 4) as i64,
+            document,
+            rows.row_lengths.as_ref(),
+            rows.next_states.as_ref(),
+            rows.probabilities.as_ref(),
+            rows.visit_counts.as_ref(),
+        ],
+    )?;
+    Ok(inserted == 1)
+}
+
+/// Reads a model.
+pub(super) fn get(connection: &Connection, path: &Path, model_id: &str) -> Result<Option<Model>, StoreError> {
+    let fail = |e: rusqlite::Error| StoreError::from_sqlite(path, &e);
+    let found = connection
+        .query_row(
+            "SELECT header, row_lengths, next_states, probabilities, visit_counts FROM models WHERE model_id = ?",
+            [model_id],
+            |row| {
+                let blob = |column| row.get::<_, Vec<u8>>(column).map(Bytes::from);
+                let rows = Rows {
+                    row_lengths: blob(1)?,
+                    next_states: blob(2)?,
+                    probabilities: blob(3)?,
+                    visit_counts: blob(4)?,
+                };
+                Ok((blob(0)?, rows))
+            },
+        )
+        .optional()
+        .map_err(fail)?;
+    found.map(|(document, rows)| Ok(Model { header: decode_header(document, model_id)?, rows })).transpose()
+}
+
+/// Lists models in the order of their ids; an empty `env_id` means any.
+pub(super) fn list(connection: &Connection, path: &Path, env_id: &str) -> Result<Vec<ModelInfo>, StoreError> {
+    let fail = |e: rusqlite::Error| StoreError::from_sqlite(path, &e);
+    let mut statement = connection
+        .prepare(
+            "SELECT model_id, header, n_transitions, stored_at FROM models WHERE ?1 = '' OR env_id = ?1 \
+             ORDER BY model_id",
+        )
+        .map_err(fail)?;
+    let mut rows = statement.query([env_id]).map_err(fail)?;
+    let mut models = Vec::new();
+    while let Some(row) = rows.next().map_err(fail)? {
+        let model_id: String = row.get(0).map_err(fail)?;
+        let document: Vec<u8> = row.get(1).map_err(fail)?;
+        models.push(ModelInfo {
+            header: decode_header(document.into(), &model_id)?,
+            n_transitions: row.get::<_, i64>(2).map_err(fail)? as u64,
+            stored_at_us: row.get(3).map_err(fail)?,
+        });
+    }
+    Ok(models)
+}
+
+fn decode_header(mut document: Bytes, model_id: &str) -> Result<ModelHeader, StoreError> {
+    let corrupt = |message: String| StoreError::Corrupt { what: format!("header of model {model_id}"), message };
+    if document.first() != Some(&DOCUMENT_VERSION) {
+        return Err(corrupt(format!("expected version {DOCUMENT_VERSION}, got {:?}", document.first())));
+    }
+    ModelHeader::decode(document.split_off(1)).map_err(|e| corrupt(e.to_string()))
+}

@@ -1,0 +1,189 @@
+//! The database file: its schema, its migrations, and how a connection is set up.
+//!
+//! Invariants: a migration, once released, never changes; a schema newer than this release is refused, not guessed at;
+//! opening and migrating happen under a lock on a file beside the database, so several processes may start at once.
+
+use super::StoreError;
+use rusqlite::{Connection, OpenFlags};
+use rusqlite_migration::{M, Migrations};
+use std::{
+    fs::{self, File},
+    path::{Path, PathBuf},
+    time::Duration,
+};
+
+/// Name of the database in the data directory.
+pub const FILE_NAME: &str = "mazeway.sqlite3";
+/// "MZWY": tells the file from any other SQLite database.
+const APPLICATION_ID: i64 = 0x4d5a_5759;
+/// How long a connection waits for another process.
+const BUSY_TIMEOUT: Duration = Duration::from_secs(30);
+
+/// What is common to many trajectories lies in `collections`, each stored once. A trajectory's arrays are blobs,
+/// little-endian without padding: states and actions as 32-bit integers, rewards as IEEE 754 doubles. Seeds are
+/// unsigned and stored by their bits. Times are microseconds since the Unix epoch. Documents are a version byte and a
+/// protocol buffer message.
+const V1: &str = "
+CREATE TABLE collections (
+    id INTEGER PRIMARY KEY,
+    env_id TEXT NOT NULL,
+    model_id TEXT NOT NULL,
+    style TEXT NOT NULL,
+    source TEXT NOT NULL,
+    n_states INTEGER NOT NULL,
+    n_actions INTEGER NOT NULL,
+    UNIQUE (env_id, style, model_id, source, n_states, n_actions)
+) STRICT;
+
+CREATE TABLE trajectories (
+    seq INTEGER PRIMARY KEY AUTOINCREMENT,
+    trajectory_id TEXT NOT NULL UNIQUE,
+    collection INTEGER NOT NULL REFERENCES collections (id),
+    recorded_at INTEGER NOT NULL,
+    seed INTEGER,
+    steps INTEGER NOT NULL,
+    final_state INTEGER,
+    terminated INTEGER NOT NULL,
+    truncated INTEGER NOT NULL,
+    content_hash BLOB NOT NULL,
+    states BLOB NOT NULL,
+    actions BLOB NOT NULL,
+    rewards BLOB NOT NULL
+) STRICT;
+
+CREATE INDEX trajectories_by_collection ON trajectories (collection, seq);
+
+CREATE TABLE models (
+    model_id TEXT PRIMARY KEY,
+    env_id TEXT NOT NULL,
+    stored_at INTEGER NOT NULL,
+    n_transitions INTEGER NOT NULL,
+    header BLOB NOT NULL,
+    row_lengths BLOB NOT NULL,
+    next_states BLOB NOT NULL,
+    probabilities BLOB NOT NULL,
+    visit_counts BLOB NOT NULL
+) STRICT;
+
+CREATE TABLE fits (
+    seq INTEGER PRIMARY KEY AUTOINCREMENT,
+    fit_id TEXT NOT NULL UNIQUE,
+    created_at INTEGER NOT NULL,
+    env_id TEXT NOT NULL,
+    style TEXT NOT NULL,
+    method TEXT NOT NULL,
+    model_id TEXT NOT NULL,
+    trajectories INTEGER NOT NULL,
+    stopped INTEGER NOT NULL,
+    iterations INTEGER NOT NULL,
+    agreement REAL NOT NULL,
+    document BLOB NOT NULL
+) STRICT;
+
+CREATE INDEX fits_by_env ON fits (env_id, style, seq);
+
+PRAGMA application_id = 0x4d5a5759;
+";
+
+const MIGRATIONS: &[M<'static>] = &[M::up(V1)];
+
+/// Makes the directory and the database where they are missing, brings the schema up to date, and returns the path of
+/// the database and a connection for writing.
+pub fn open(directory: &Path) -> Result<(PathBuf, Connection), StoreError> {
+    let fail = |e: std::io::Error| StoreError::directory(directory, &e);
+    fs::create_dir_all(directory).map_err(fail)?;
+    let lock =
+        File::options().create(true).truncate(false).write(true).open(directory.join("mazeway.lock")).map_err(fail)?;
+    lock.lock().map_err(fail)?;
+    let path = directory.join(FILE_NAME);
+    let sqlite = |e: rusqlite::Error| StoreError::from_sqlite(&path, &e);
+    let mut connection = Connection::open(&path).map_err(sqlite)?;
+    connection.busy_timeout(BUSY_TIMEOUT).map_err(sqlite)?;
+    check_owner(&path, &connection)?;
+    // FULL makes a commit in WAL mode wait for the disk; `fullfsync` makes macOS mean it.
+    connection.pragma_update(None, "journal_mode", "WAL").map_err(sqlite)?;
+    connection.pragma_update(None, "synchronous", "FULL").map_err(sqlite)?;
+    connection.pragma_update(None, "fullfsync", true).map_err(sqlite)?;
+    connection.pragma_update(None, "foreign_keys", true).map_err(sqlite)?;
+    Migrations::from_slice(MIGRATIONS).to_latest(&mut connection).map_err(|error| match error {
+        rusqlite_migration::Error::RusqliteError { err, .. } => StoreError::from_sqlite(&path, &err),
+        other => StoreError::Database { path: path.clone(), message: other.to_string() },
+    })?;
+    drop(lock);
+    Ok((path, connection))
+}
+
+/// A connection that only reads; it sees the last commit at the start of each of its statements or transactions.
+pub fn open_reader(path: &Path) -> Result<Connection, StoreError> {
+    let sqlite = |e: rusqlite::Error| StoreError::from_sqlite(path, &e);
+    let flags = OpenFlags::SQLITE_OPEN_READ_WRITE | OpenFlags::SQLITE_OPEN_NO_MUTEX;
+    let connection = Connection::open_with_flags(path, flags).map_err(sqlite)?;
+    connection.busy_timeout(BUSY_TIMEOUT).map_err(sqlite)?;
+    connection.pragma_update(None, "query_only", true).map_err(sqlite)?;
+    Ok(connection)
+}
+
+/// Refuses files of other programs and of newer releases before anything in them is touched.
+fn check_owner(path: &Path, connection: &Connection) -> Result<(), StoreError> {
+    let sqlite = |e: rusqlite::Error| StoreError::from_sqlite(path, &e);
+    let number = |pragma| connection.pragma_query_value(None, pragma, |row| row.get::<_, i64>(0)).map_err(sqlite);
+    let (application_id, found) = (number("application_id")?, number("user_version")?);
+    let tables: i64 =
+        connection.query_row("SELECT count(*) FROM sqlite_schema", [], |row| row.get(0)).map_err(sqlite)?;
+    if application_id != APPLICATION_ID && (tables > 0 || application_id != 0) {
+        return Err(StoreError::Foreign { path: path.to_owned(), found: application_id });
+    }
+    let supported = MIGRATIONS.len() as i64;
+    if found > supported {
+        return Err(StoreError::NewerSchema { path: path.to_owned(), found, supported });
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn migrations_are_sound() {
+        Migrations::from_slice(MIGRATIONS).validate().unwrap();
+    }
+
+    #[test]
+    fn a_newer_schema_is_refused_and_left_alone() {
+        let directory = tempfile::tempdir().unwrap();
+        let (path, connection) = open(directory.path()).unwrap();
+        connection.pragma_update(None, "user_version", 99).unwrap();
+        drop(connection);
+        let error = open(directory.path()).unwrap_err();
+        assert!(matches!(error, StoreError::NewerSchema { found: 99, supported: 1, .. }), "{error}");
+        let connection = Connection::open(path).unwrap();
+        let version: i64 = connection.pragma_query_value(None, "user_version", |row| row.get(0)).unwrap();
+        assert_eq!(version, 99);
+    }
+
+    #[test]
+    fn a_database_of_another_program_is_refused() {
+        let directory = tempfile::tempdir().unwrap();
+        let connection = Connection::open(directory.path().join(FILE_NAME)).unwrap();
+        connection.execute_batch("CREATE TABLE theirs (x)").unwrap();
+        drop(connection);
+        assert!(matches!(open(directory.path()).unwrap_err(), StoreError::Foreign { found: 0, .. }));
+    }
+
+    #[test]
+    fn a_file_that_is_no_database_is_corrupt() {
+        let directory = tempfile::tempdir().unwrap();
+        fs::write(directory.path().join(FILE_NAME), "not a database, whatever its name says ".repeat(50)).unwrap();
+        assert!(matches!(open(directory.path()).unwrap_err(), StoreError::Corrupt { .. }));
+    }
+
+    #[test]
+    fn a_commit_waits_for_the_disk() {
+        let directory = tempfile::tempdir().unwrap();
+        let (_, connection) = open(directory.path()).unwrap();
+        let mode: String = connection.pragma_query_value(None, "journal_mode", |row| row.get(0)).unwrap();
+        let synchronous: i64 = connection.pragma_query_value(None, "synchronous", |row| row.get(0)).unwrap();
+        assert_eq!((mode.as_str(), synchronous), ("wal", 2));
+    }
+}

@@ -1,0 +1,159 @@
+//! The one thread that writes, and why it is one: everything that arrives while a commit waits for the disk goes into
+//! the next commit, so that a hundred clients cost about as many syncs as one.
+//!
+//! Invariant: an answer is given only after the commit that holds it has returned. A job that fails takes back its own
+//! changes and nobody else's.
+
+use super::{StoreError, trajectories::CollectionCache};
+use rusqlite::{Connection, TransactionBehavior};
+use std::{
+    path::{Path, PathBuf},
+    thread,
+};
+use tokio::sync::{mpsc, oneshot};
+
+/// Jobs that wait for the writer at most; more wait in their callers.
+const QUEUED_JOBS: usize = 1024;
+/// Jobs in one commit at most.
+const JOBS_A_COMMIT: usize = 512;
+
+/// What a job works with.
+pub(super) struct Work<'a> {
+    pub(super) connection: &'a Connection,
+    pub(super) path: &'a Path,
+    pub(super) collections: &'a mut CollectionCache,
+    /// Why the job failed.
+    failed: Option<StoreError>,
+}
+
+/// Tells the caller how it went, once it is known how the commit went.
+type Answer = Box<dyn FnOnce(Result<(), StoreError>) + Send>;
+/// Runs in a transaction, or hears that there is none.
+type Job = Box<dyn FnOnce(Result<&mut Work<'_>, StoreError>) -> Answer + Send>;
+
+/// Takes jobs to the writing thread.
+#[derive(Debug)]
+pub(super) struct Writer {
+    jobs: Option<mpsc::Sender<Job>>,
+    thread: Option<thread::JoinHandle<()>>,
+}
+
+impl Writer {
+    pub(super) fn start(connection: Connection, path: PathBuf) -> Result<Self, StoreError> {
+        let (jobs, queue) = mpsc::channel(QUEUED_JOBS);
+        let thread = thread::Builder::new()
+            .name("store-writer".into())
+            .spawn({
+                let path = path.clone();
+                move || write(connection, &path, queue)
+            })
+            .map_err(|e| StoreError::directory(&path, &e))?;
+        Ok(Self { jobs: Some(jobs), thread: Some(thread) })
+    }
+
+    /// Runs `job` in a transaction and returns its result once that is on stable storage.
+    pub(super) async fn submit<T: Send + 'static>(
+        &self,
+        job: impl FnOnce(&mut Work<'_>) -> Result<T, StoreError> + Send + 'static,
+    ) -> Result<T, StoreError> {
+        let (answer, result) = oneshot::channel();
+        let job: Job = Box::new(move |work| {
+            let outcome = work.and_then(|work| in_savepoint(work, job));
+            Box::new(move |commit| {
+                // A caller that has gone does not want its answer.
+                let _ = answer.send(outcome.and_then(|value| commit.map(|()| value)));
+            })
+        });
+        let jobs = self.jobs.as_ref().ok_or(StoreError::Closed)?;
+        jobs.send(job).await.map_err(|_| StoreError::Closed)?;
+        result.await.map_err(|_| StoreError::Closed)?
+    }
+}
+
+impl Drop for Writer {
+    /// Waits for the jobs that are queued: what was submitted is written.
+    fn drop(&mut self) {
+        self.jobs.take();
+        if let Some(thread) = self.thread.take()
+            && thread.join().is_err()
+        {
+            tracing::error!("the store's writer panicked");
+        }
+    }
+}
+
+fn write(mut connection: Connection, path: &Path, mut queue: mpsc::Receiver<Job>) {
+    let mut collections = CollectionCache::new();
+    while let Some(first) = queue.blocking_recv() {
+        let mut answers = Vec::new();
+        let result = commit_together(&mut connection, path, &mut collections, first, &mut queue, &mut answers);
+        if let Err(error) = &result {
+            tracing::error!(%error, jobs = answers.len(), "a commit failed");
+            // Rows of collections that were made in it are gone.
+            collections.clear();
+        }
+        for answer in answers {
+            answer(result.clone());
+        }
+    }
+}
+
+fn commit_together(
+    connection: &mut Connection,
+    path: &Path,
+    collections: &mut CollectionCache,
+    first: Job,
+    queue: &mut mpsc::Receiver<Job>,
+    answers: &mut Vec<Answer>,
+) -> Result<(), StoreError> {
+    let fail = |e: rusqlite::Error| StoreError::from_sqlite(path, &e);
+    let transaction = match connection.transaction_with_behavior(TransactionBehavior::Immediate) {
+        Ok(transaction) => transaction,
+        Err(error) => {
+            let error = fail(error);
+            answers.push(first(Err(error.clone())));
+            return Err(error);
+        }
+    };
+    let mut job = first;
+    loop {
+        let mut work = Work { connection: &transaction, path, collections, failed: None };
+        answers.push(job(Ok(&mut work)));
+        // Some errors, a full disk among them, make SQLite roll back the whole transaction and not the statement alone.
+        if let Some(error) = work.failed
+            && transaction.is_autocommit()
+        {
+            return Err(error);
+        }
+        if answers.len() >= JOBS_A_COMMIT {
+            break;
+        }
+        match queue.try_recv() {
+            Ok(next) => job = next,
+            Err(_) => break,
+        }
+    }
+    transaction.commit().map_err(fail)
+}
+
+/// Runs a job so that its failure leaves no trace.
+fn in_savepoint<T>(
+    work: &mut Work<'_>,
+    job: impl FnOnce(&mut Work<'_>) -> Result<T, StoreError>,
+) -> Result<T, StoreError> {
+    let execute =
+        |work: &Work<'_>, sql| work.connection.execute_batch(sql).map_err(|e| StoreError::from_sqlite(work.path, &e));
+    let outcome = execute(work, "SAVEPOINT job").and_then(|()| job(work)).and_then(|value| {
+        execute(work, "RELEASE job")?;
+        Ok(value)
+    });
+    if let Err(error) = &outcome {
+        work.failed = Some(error.clone());
+        // Rows of collections that the job made are taken back with it.
+        work.collections.clear();
+        if !work.connection.is_autocommit() {
+            execute(work, "ROLLBACK TO job; RELEASE job")?;
+        }
+    }
+    outcome
+}

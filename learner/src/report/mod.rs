@@ -6,7 +6,13 @@
 //! not finite is drawn as missing, never printed as a number; text that came from a user is escaped wherever it lands.
 //! Deliberately absent: any computation of what is reported.
 
+mod format;
 pub mod json;
+pub mod pictures;
+#[cfg(test)]
+mod samples;
+mod space;
+pub mod table;
 
 use crate::irl::{FitOptions, Stopped, TraceEntry};
 use serde::{Deserialize, Serialize};

@@ -1,0 +1,375 @@
+//! Tables for a terminal: drivers side by side, the fit in a glance, and what was learned in each state.
+//!
+//! Invariants: no line is wider than the terminal where a table can be made narrow enough, and no escape code is written unless colours are wanted.
+
+use super::format::{MISSING, alike, brief, clip, count, decimals, duration, fixed, interval, percent, stopped};
+use super::space::{Heading, LANES, LaneChange, SPEEDS_MPS, TRAFFIC, highway_action, highway_state};
+use super::{DriverMetrics, Interval, Report, ReportError};
+use comfy_table::{Cell, CellAlignment, Color, ContentArrangement, LineStyle, Table, TableStyle};
+use std::io::IsTerminal;
+
+/// States listed where the environment has no layout that is known here.
+const MOST_STATES: usize = 40;
+/// Width at which the highway's states stand three to a line.
+const WIDE: usize = 108;
+
+const RULE: LineStyle = LineStyle::none().fill('─').junction('─');
+const STYLE: TableStyle = TableStyle::new().top_border(RULE).header_separator(RULE).bottom_border(RULE);
+
+/// How wide to write, and whether with colours.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Terminal {
+    /// Columns.
+    pub width: usize,
+    /// Whether escape codes for colours are understood and wanted.
+    pub colour: bool,
+}
+
+impl Terminal {
+    /// What standard output is: the terminal's width, colours unless `NO_COLOR` is set or the terminal is dumb;
+    /// 120 columns without colours where it is no terminal.
+    pub fn stdout() -> Self {
+        let tty = std::io::stdout().is_terminal();
+        let set = |name: &str| std::env::var_os(name).is_some_and(|value| !value.is_empty());
+        let dumb = std::env::var_os("TERM").is_some_and(|term| term == "dumb");
+        let width = if tty { Table::new().width().map(usize::from).filter(|&w| w > 0) } else { None };
+        Self { width: width.unwrap_or(120), colour: tty && !dumb && !set("NO_COLOR") }
+    }
+
+    fn table(self) -> Table {
+        let mut table = Table::new();
+        table
+            .load_style(STYLE)
+            .set_content_arrangement(ContentArrangement::Dynamic)
+            .set_width(self.width.clamp(20, usize::from(u16::MAX)) as u16);
+        if self.colour {
+            table.enforce_styling();
+        } else {
+            table.force_no_tty();
+        }
+        table
+    }
+
+    fn paint(self, text: &str, code: &str) -> String {
+        if self.colour { format!("\x1b[{code}m{text}\x1b[0m") } else { text.to_owned() }
+    }
+
+    fn heading(self, text: &str) -> String {
+        self.paint(text, "1")
+    }
+
+    fn dim(self, text: &str) -> String {
+        self.paint(text, "2")
+    }
+}
+
+/// All tables of a report, one under another, ending with a newline.
+///
+/// # Errors
+/// Arrays of the wrong shape.
+pub fn render(report: &Report, terminal: Terminal) -> Result<String, ReportError> {
+    report.check()?;
+    let mut parts = Vec::new();
+    parts.extend(drivers(report, terminal));
+    parts.push(summary(report, terminal));
+    parts.push(states(report, terminal));
+    if !report.warnings.is_empty() {
+        let lines = report
+            .warnings
+            .iter()
+            .map(|warning| format!("{} {}", terminal.paint("warning:", "33"), clip(warning, 2000)));
+        parts.push(lines.collect::<Vec<_>>().join("\n"));
+    }
+    Ok(parts.join("\n\n") + "\n")
+}
+
+/// A header cell.
+fn head(text: impl Into<String>) -> Cell {
+    Cell::new(text.into()).fg(Color::DarkGrey)
+}
+
+fn right_align(table: &mut Table, columns: impl IntoIterator<Item = usize>) {
+    for column in columns {
+        if let Some(column) = table.column_mut(column) {
+            column.set_cell_alignment(CellAlignment::Right);
+        }
+    }
+}
+
+/// Expert, learned and random side by side; `None` where no driver was rolled out.
+fn drivers(report: &Report, terminal: Terminal) -> Option<String> {
+    let drivers = report.drivers.as_ref()?;
+    let rows =
+        [("expert", drivers.expert.as_ref()), ("learned", Some(&drivers.learned)), ("random", Some(&drivers.random))];
+    let known: Vec<&DriverMetrics> = rows.iter().filter_map(|&(_, metrics)| metrics).collect();
+    let columns: [(&str, fn(&DriverMetrics) -> &Interval, usize, usize); 4] = [
+        ("mean speed m/s", |m| &m.speed_mps, 2, 3),
+        ("collisions a step", |m| &m.collisions, 3, 5),
+        ("overtakes left a step", |m| &m.overtakes_left, 3, 5),
+        ("overtakes right a step", |m| &m.overtakes_right, 3, 5),
+    ];
+    let mut table = terminal.table();
+    table.set_header(std::iter::once(head("driver")).chain(columns.iter().map(|column| head(column.0))));
+    for (name, metrics) in rows {
+        let mut cells = vec![Cell::new(name)];
+        for (_, value, least, most) in columns {
+            let places = decimals(known.iter().map(|&m| value(m)), least, most);
+            cells.push(Cell::new(metrics.map_or_else(|| MISSING.to_owned(), |m| interval(value(m), places))));
+        }
+        if name == "learned" {
+            cells = cells.into_iter().map(|cell| cell.fg(Color::Cyan)).collect();
+        }
+        table.add_row(cells);
+    }
+    right_align(&mut table, 1..5);
+    let note = report.evaluation.map_or_else(String::new, |evaluation| {
+        format!(", {} episodes of {} steps each", count(evaluation.episodes as f64), count(evaluation.steps as f64))
+    });
+    Some(format!(
+        "{}{}\n{}",
+        terminal.heading("Drivers"),
+        terminal.dim(&format!("  mean ± 95 % interval{note}")),
+        table.trim_fmt()
+    ))
+}
+
+/// The fit in a glance, as names and values.
+pub(crate) fn summary_rows(report: &Report) -> Vec<(&'static str, String)> {
+    let share = |part: f64, of: f64| if of > 0.0 { format!(" ({})", percent(part / of)) } else { String::new() };
+    let mut rows = vec![("action agreement", {
+        let held_out = report.agreement_held_out.map(|held_out| format!("; {} on unseen steps", percent(held_out)));
+        format!("{} of the demonstrated steps{}", percent(report.agreement), held_out.unwrap_or_default())
+    })];
+    if let Some(optimal) = report.optimal_share() {
+        rows.push(("optimal action", format!("{} of the states", percent(optimal))));
+    }
+    if let Some(difference) = report.expected_value_difference {
+        rows.push(("expected value difference", brief(difference)));
+    }
+    rows.push(("log-likelihood", {
+        let held_out =
+            report.log_likelihood_per_step_held_out.map(|value| format!("; {} on unseen steps", fixed(value, 3)));
+        format!("{} a step{}", fixed(report.log_likelihood_per_step, 3), held_out.unwrap_or_default())
+    }));
+    rows.push(("states covered", {
+        let (covered, all) = (f64::from(report.states_covered), f64::from(report.n_states));
+        format!("{} of {}{}", count(covered), count(all), share(covered, all))
+    }));
+    rows.push((
+        "stopped",
+        match report.iterations {
+            0 => stopped(report.stopped).to_owned(),
+            1 => format!("{} after 1 iteration", stopped(report.stopped)),
+            n => format!("{} after {} iterations", stopped(report.stopped), count(f64::from(n))),
+        },
+    ));
+    rows.push(("time", format!("{} for the fit, {} in all", duration(report.fit_secs), duration(report.total_secs))));
+    rows
+}
+
+fn summary(report: &Report, terminal: Terminal) -> String {
+    let rows = summary_rows(report);
+    let width = rows.iter().map(|row| row.0.chars().count()).max().unwrap_or(0);
+    let what = format!(
+        "{} on {} × {} steps of {}{}",
+        clip(&report.method, 40),
+        count(report.trajectories as f64),
+        report.horizon,
+        clip(&report.env_id, 40),
+        if report.style.is_empty() { String::new() } else { format!(", {}", clip(&report.style, 40)) },
+    );
+    let mut text = format!("{}  {}", terminal.heading("Fit"), terminal.dim(&what));
+    for (name, value) in rows {
+        text += &format!("\n  {} {value}", terminal.dim(&format!("{name:width$}")));
+    }
+    text
+}
+
+fn states(report: &Report, terminal: Terminal) -> String {
+    if report.is_highway() {
+        highway(report, terminal)
+    } else if let (Some(_), Some(headings)) = (&report.grid, report.headings()) {
+        grid(report, &headings, terminal)
+    } else {
+        listing(report, terminal)
+    }
+}
+
+/// `left → 30` in words of the highway.
+pub(crate) fn highway_choice(report: &Report, state: usize) -> String {
+    let choices = report.choices(&report.greedy_policy, state);
+    let Some(&(action, _)) = choices.first() else { return MISSING.to_owned() };
+    let (change, speed) = highway_action(action);
+    let change = match change {
+        LaneChange::Keep => "keep",
+        LaneChange::Left => "left",
+        LaneChange::Right => "right",
+    };
+    if choices.len() == report.actions() {
+        return "any".to_owned();
+    }
+    format!("{change} {}{}", SPEEDS_MPS[speed], ties(&choices))
+}
+
+/// How many other actions are as good.
+fn ties(choices: &[(usize, f64)]) -> String {
+    if choices.len() > 1 { format!(" +{}", choices.len() - 1) } else { String::new() }
+}
+
+/// The 36 states, by lane and speed, three kinds of traffic to a line where there is room.
+fn highway(report: &Report, terminal: Terminal) -> String {
+    let wide = terminal.width >= WIDE;
+    let mut table = terminal.table();
+    let fields = ["action", "reward", "value", "visits"];
+    if wide {
+        let names = TRAFFIC.iter().flat_map(|traffic| fields.iter().map(move |field| (traffic, field)));
+        table.set_header([head("lane"), head("m/s")].into_iter().chain(names.map(|(traffic, field)| {
+            head(if *field == "action" { format!("{traffic}:\naction") } else { format!("\n{field}") })
+        })));
+    } else {
+        table.set_header([head("lane"), head("m/s"), head("traffic")].into_iter().chain(fields.map(head)));
+    }
+    let reward = alike((0..report.states()).map(|state| report.greedy_reward(state)));
+    let value = alike(report.state_values.iter().copied());
+    let shade = |cell: Cell, state: usize| if report.visited(state) { cell } else { cell.fg(Color::DarkGrey) };
+    let cells = |state: usize| {
+        [
+            highway_choice(report, state),
+            reward(report.greedy_reward(state)),
+            value(report.state_values[state]),
+            count(report.state_visits[state]),
+        ]
+        .map(|text| shade(Cell::new(text), state))
+    };
+    for lane in (0..3).rev() {
+        if lane < 2 {
+            table.add_row([""]);
+        }
+        for (speed, mps) in SPEEDS_MPS.iter().enumerate() {
+            let lane_name = if speed == 0 { LANES[lane] } else { "" };
+            if wide {
+                let row = (0..3).flat_map(|traffic| cells(highway_state(lane, speed, traffic)));
+                table.add_row([Cell::new(lane_name), Cell::new(mps)].into_iter().chain(row));
+            } else {
+                for (traffic, name) in TRAFFIC.iter().enumerate() {
+                    let first = if traffic == 0 { [lane_name.to_owned(), mps.to_string()] } else { Default::default() };
+                    let row = cells(highway_state(lane, speed, traffic));
+                    table.add_row(first.into_iter().chain([(*name).to_owned()]).map(Cell::new).chain(row));
+                }
+            }
+        }
+    }
+    right_align(&mut table, if wide { vec![1, 3, 4, 5, 7, 8, 9, 11, 12, 13] } else { vec![1, 4, 5, 6] });
+    let note = "action: lane change and speed in m/s; grey or 0 visits: not seen in the demonstrations";
+    format!("{}\n{}\n{}", terminal.heading("Learned policy and reward"), terminal.dim(note), table.trim_fmt())
+}
+
+/// One character for what a policy does in a state of a grid.
+fn arrow(choices: &[(usize, f64)], headings: &[Heading]) -> char {
+    use Heading::{East, North, South, Stay, West};
+    let mut set: Vec<Heading> = choices.iter().map(|&(action, _)| headings[action]).collect();
+    set.sort_by_key(|heading| *heading as u8);
+    set.dedup();
+    match set.as_slice() {
+        [North] => '↑',
+        [South] => '↓',
+        [East] => '→',
+        [West] => '←',
+        [Stay] => '•',
+        [North, South] => '↕',
+        [East, West] => '↔',
+        [North, East] => '↗',
+        [North, West] => '↖',
+        [South, East] => '↘',
+        [South, West] => '↙',
+        [] => '?',
+        _ => '+',
+    }
+}
+
+/// The policy over the grid, the optimal one beside it where it is known.
+fn grid(report: &Report, headings: &[Heading], terminal: Terminal) -> String {
+    let layout = report.grid.as_ref().expect("the caller checked");
+    let (rows, columns) = (layout.rows as usize, layout.columns as usize);
+    let mut state_of = vec![None; rows * columns];
+    for (state, &cell) in layout.cells.iter().enumerate() {
+        state_of[cell as usize] = Some(state);
+    }
+    let draw = |policy: &[f64], row: usize| -> String {
+        let cells = (0..columns).map(|column| match state_of[row * columns + column] {
+            None => terminal.dim("█"),
+            Some(state) => {
+                let mark = arrow(&report.choices(policy, state), headings).to_string();
+                if report.visited(state) { mark } else { terminal.dim(&mark) }
+            }
+        });
+        cells.collect::<Vec<_>>().join(" ")
+    };
+    let panel = (2 * columns).saturating_sub(1).max(15);
+    if 2 + panel > terminal.width || rows > 200 {
+        return listing(report, terminal);
+    }
+    let gap = panel + 4 - (2 * columns).saturating_sub(1);
+    let beside = report.optimal_policy.as_ref().filter(|_| 2 + 2 * panel + 4 <= terminal.width);
+    let mut text =
+        format!("{}{}\n  {:panel$}", terminal.heading("Learned policy"), terminal.dim("  █ wall, ↗ + ties"), "learned");
+    if beside.is_some() {
+        text += "    optimal";
+    }
+    for row in 0..rows {
+        text += &format!("\n  {}", draw(&report.greedy_policy, row));
+        if let Some(policy) = beside {
+            text += &format!("{:gap$}{}", "", draw(policy, row));
+        }
+    }
+    text.lines().map(str::trim_end).collect::<Vec<_>>().join("\n")
+}
+
+/// The states visited most, one a line.
+fn listing(report: &Report, terminal: Terminal) -> String {
+    let (states, all) = report.leading_states(MOST_STATES);
+    let mut table = terminal.table();
+    table.set_header(["state", "visits", "greedy action", "reward", "value"].map(head));
+    let reward = alike(states.iter().map(|&state| report.greedy_reward(state)));
+    let value = alike(states.iter().map(|&state| report.state_values[state]));
+    for &state in &states {
+        let choices = report.choices(&report.greedy_policy, state);
+        let action = choices.first().map_or_else(|| MISSING.to_owned(), |&(action, _)| report.action_name(action, 24));
+        let row = [
+            report.state_name(state, 40),
+            count(report.state_visits[state]),
+            action + &ties(&choices),
+            reward(report.greedy_reward(state)),
+            value(report.state_values[state]),
+        ];
+        let grey = !report.visited(state);
+        table.add_row(row.map(|text| if grey { Cell::new(text).fg(Color::DarkGrey) } else { Cell::new(text) }));
+    }
+    right_align(&mut table, [1, 3, 4]);
+    let note = if all {
+        String::new()
+    } else {
+        format!("  the {} visited most of {}", states.len(), count(f64::from(report.n_states)))
+    };
+    format!("{}{}\n{}", terminal.heading("Learned policy and reward"), terminal.dim(&note), table.trim_fmt())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::samples;
+    use super::*;
+
+    fn plain(report: &Report, width: usize) -> String {
+        render(report, Terminal { width, colour: false }).expect("a whole report")
+    }
+
+    #[test]
+    fn look() {
+        for width in [80, 132] {
+            println!("{}", plain(&samples::highway(), width));
+        }
+        println!("{}", plain(&samples::maze(), 80));
+        println!("{}", plain(&samples::plain(100, 3), 80));
+        println!("{}", render(&samples::maze(), Terminal { width: 80, colour: true }).unwrap());
+    }
+}

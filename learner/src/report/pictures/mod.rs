@@ -1,5 +1,74 @@
 //! Pictures of a report as SVG, and as PNG from those.
+//!
+//! A picture is a white card 400 units wide, which a phone shows whole, or a sheet of several. Colours mean the same on
+//! all of them: darker is more, hatched was not visited by the demonstrations, tinted differs from what is known to be right.
 
+mod canvas;
+mod colour;
+mod grid;
+mod panel;
 mod raster;
 
+use super::{Report, ReportError};
 pub use raster::png;
+
+/// What a picture tells of.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Part {
+    /// The demonstrations.
+    Seen,
+    /// What was learned from them.
+    Learned,
+    /// What is known to be right.
+    True,
+    /// How the fit went.
+    Fit,
+    /// Several pictures on one sheet, for a paper or a slide; not repeated on the page.
+    Sheet,
+}
+
+/// A picture with what is said of it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Picture {
+    /// File name without its extension.
+    pub name: &'static str,
+    /// What it tells of.
+    pub part: Part,
+    /// A few words.
+    pub title: &'static str,
+    /// How to read it.
+    pub caption: String,
+    /// The picture: an SVG document that refers to nothing outside.
+    pub svg: String,
+}
+
+/// All pictures of a report, in the order in which they are shown.
+///
+/// # Errors
+/// Arrays of the wrong shape, or what the drawing library says.
+pub fn all(report: &Report) -> Result<Vec<Picture>, ReportError> {
+    report.check()?;
+    let mut pictures = grid::pictures(report)?;
+    let _ = &mut pictures;
+    Ok(pictures)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::report::samples;
+
+    #[test]
+    fn look() {
+        for (name, report) in
+            [("maze", samples::maze()), ("highway", samples::highway()), ("plain", samples::plain(30, 3))]
+        {
+            let dir = std::path::Path::new("/tmp/look").join(name);
+            std::fs::create_dir_all(&dir).unwrap();
+            for picture in all(&report).unwrap() {
+                std::fs::write(dir.join(format!("{}.svg", picture.name)), &picture.svg).unwrap();
+                std::fs::write(dir.join(format!("{}.png", picture.name)), png(&picture.svg).unwrap()).unwrap();
+            }
+        }
+    }
+}

@@ -1,3 +1,64 @@
 //! The environment server's binary.
 
-fn main() {}
+use clap::Parser as _;
+use mazeway_server::{config::Cli, serve};
+use std::{
+    io::Write as _,
+    process::ExitCode,
+};
+use tokio::net::TcpListener;
+use tracing_subscriber::EnvFilter;
+
+fn main() -> ExitCode {
+    let cli = Cli::parse();
+    let filter = EnvFilter::try_from_env("MAZEWAY_LOG").unwrap_or_else(|_| EnvFilter::new("warn"));
+    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
+    if !cli.listen.ip().is_loopback() && !cli.insecure {
+        return refuse(
+            2,
+            &format!("{} is reached from other machines, and nothing on it is encrypted or authenticated", cli.listen),
+            "listen on 127.0.0.1, or add --insecure where the network is trusted",
+        );
+    }
+    let runtime = match tokio::runtime::Builder::new_multi_thread().enable_all().build() {
+        Ok(runtime) => runtime,
+        Err(error) => return refuse(1, &format!("no threads to run on: {error}"), "raise the limit on processes"),
+    };
+    runtime.block_on(run(cli))
+}
+
+async fn run(cli: Cli) -> ExitCode {
+    let listener = match TcpListener::bind(cli.listen).await {
+        Ok(listener) => listener,
+        Err(error) => {
+            return refuse(1, &format!("cannot listen on {}: {error}", cli.listen), "take a free port: --listen 127.0.0.1:0");
+        }
+    };
+    let address = listener.local_addr().unwrap_or(cli.listen);
+    // Whoever started this may have closed the other end; the server serves all the same.
+    let _ = writeln!(std::io::stdout(), "listening on {address}").and_then(|()| std::io::stdout().flush());
+    match serve(cli.config, listener, stop_signal()).await {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => refuse(1, &error.to_string(), "set MAZEWAY_LOG=info to see more"),
+    }
+}
+
+/// SIGINT or SIGTERM.
+async fn stop_signal() {
+    #[cfg(unix)]
+    {
+        use tokio::signal::unix::{SignalKind, signal};
+        let mut terminate = signal(SignalKind::terminate()).expect("a runtime with signals");
+        tokio::select! {
+            _ = tokio::signal::ctrl_c() => {}
+            _ = terminate.recv() => {}
+        }
+    }
+    #[cfg(not(unix))]
+    let _ = tokio::signal::ctrl_c().await;
+}
+
+fn refuse(code: u8, error: &str, hint: &str) -> ExitCode {
+    let _ = writeln!(std::io::stderr(), "error: {error}\nhint: {hint}");
+    ExitCode::from(code)
+}

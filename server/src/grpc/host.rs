@@ -1,0 +1,98 @@
+//! What every call of a server shares.
+
+use super::status::CallError;
+use crate::{
+    batch::{BatchOptions, Layout},
+    config::Config,
+    grpc::from_proto::NewSession,
+    registry::{Options, Registry},
+    sessions::{Guard, SessionId, Sessions},
+    sim::TabularModel,
+};
+use std::{
+    sync::Arc,
+    time::{Duration, Instant},
+};
+use tokio::sync::Semaphore;
+use tokio_util::sync::CancellationToken;
+
+/// One server: its catalogue, its sessions, its limits.
+pub struct Host {
+    pub config: Config,
+    pub registry: Registry,
+    pub sessions: Arc<Sessions>,
+    /// A permit a running roll-out.
+    pub rollouts: Arc<Semaphore>,
+    /// A permit a model that is looked up or computed.
+    models: Semaphore,
+    /// Cancelled when the server is told to stop.
+    pub shutdown: CancellationToken,
+}
+
+impl Host {
+    pub fn new(config: Config, shutdown: CancellationToken) -> Self {
+        Self {
+            registry: Registry::new(),
+            sessions: Arc::new(Sessions::new(config.limits())),
+            rollouts: Arc::new(Semaphore::new(config.max_concurrent_rollouts)),
+            models: Semaphore::new(config.max_concurrent_models.max(1)),
+            config,
+            shutdown,
+        }
+    }
+
+    /// Creates a session, and says which it is and how long its lease.
+    pub fn create_session(self: &Arc<Self>, asked: &NewSession) -> Result<(Guard, Duration), CallError> {
+        let environment = self.registry.configure(&asked.env_id, &asked.options)?;
+        let spec = environment.spec();
+        let options = BatchOptions {
+            num_envs: asked.num_envs,
+            autoreset: asked.autoreset,
+            max_episode_steps: asked.max_episode_steps.unwrap_or(spec.max_episode_steps),
+            action_masks: asked.action_masks,
+        };
+        let (reply_bytes, limit) = (Layout::of(spec, options).total_len(), self.config.max_message_bytes);
+        if reply_bytes > limit {
+            let what = "bytes in a reply";
+            return Err(CallError::Limit { field: "num_envs", what, limit: limit as u64, asked: reply_bytes as u64 });
+        }
+        let now = Instant::now();
+        let (id, lease) =
+            self.sessions.create(asked.num_envs, asked.lease, now, || environment.batch(options))?;
+        Ok((self.sessions.take(id, now, None)?, lease))
+    }
+
+    /// Takes a session for one call.
+    pub fn take(self: &Arc<Self>, id: SessionId) -> Result<Guard, CallError> {
+        Ok(self.sessions.take(id, Instant::now(), None)?)
+    }
+
+    /// The tabular model of an environment, once there is a thread to compute it on.
+    pub async fn model(self: &Arc<Self>, env_id: String, options: Options) -> Result<Arc<TabularModel>, CallError> {
+        let _permit = self.models.acquire().await.map_err(|_| CallError::ShuttingDown)?;
+        let host = Arc::clone(self);
+        blocking(move || Ok(host.registry.model(&env_id, &options)?)).await
+    }
+
+    /// Ends expired sessions until the server stops.
+    pub async fn reap_sessions(self: Arc<Self>) {
+        let pause = (self.config.default_lease / 4).clamp(Duration::from_millis(10), Duration::from_secs(1));
+        loop {
+            tokio::select! {
+                () = self.shutdown.cancelled() => return,
+                () = tokio::time::sleep(pause) => {}
+            }
+            let ended = self.sessions.reap(Instant::now());
+            if ended > 0 {
+                tracing::info!(ended, "sessions expired");
+            }
+        }
+    }
+}
+
+/// Runs work that takes a while off the async threads.
+pub async fn blocking<T: Send + 'static>(
+    work: impl FnOnce() -> Result<T, CallError> + Send + 'static,
+) -> Result<T, CallError> {
+    tokio::task::spawn_blocking(work).await.map_err(|error| CallError::Internal(error.to_string()))?
+}

@@ -1,0 +1,151 @@
+//! `mazeway.env.v1.EnvironmentService`: each method decodes, calls and encodes.
+
+use super::{
+    from_proto::{self, RenderMode, RolloutLimits},
+    host::{Host, blocking},
+    interact::{self, DrawJob, DrawSender},
+    picture,
+    status::CallError,
+    to_proto,
+};
+use crate::sessions::{SessionError, SessionId};
+use bytes::Bytes;
+use futures_util::{Stream, StreamExt as _, stream};
+use mazeway_proto::env::{self as pb, environment_service_server::EnvironmentService};
+use std::{pin::Pin, sync::Arc};
+use tokio::sync::{mpsc, oneshot};
+use tokio_stream::wrappers::ReceiverStream;
+use tonic::{Request, Response, Status, Streaming};
+
+/// Messages of a roll-out that may wait for their reader.
+const WAITING_CHUNKS: usize = 2;
+
+type Answers<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
+
+/// The service over one [`Host`].
+pub struct EnvironmentGrpc(pub Arc<Host>);
+
+#[tonic::async_trait]
+impl EnvironmentService for EnvironmentGrpc {
+    type InteractStream = Answers<pb::InteractResponse>;
+    type RolloutStream = Answers<pb::RolloutResponse>;
+    type GetModelStream = Answers<pb::GetModelResponse>;
+
+    async fn list_environments(
+        &self,
+        _request: Request<pb::ListEnvironmentsRequest>,
+    ) -> Result<Response<pb::ListEnvironmentsResponse>, Status> {
+        let specs = self.0.registry.specs();
+        let environments = specs.iter().map(|spec| to_proto::spec(spec, &spec.info_columns)).collect();
+        Ok(Response::new(pb::ListEnvironmentsResponse { environments }))
+    }
+
+    async fn create_session(
+        &self,
+        request: Request<pb::CreateSessionRequest>,
+    ) -> Result<Response<pb::CreateSessionResponse>, Status> {
+        let (asked, host) = (from_proto::create_session(request.into_inner())?, Arc::clone(&self.0));
+        let session = blocking(move || {
+            let (guard, lease) = host.create_session(&asked)?;
+            let lease = lease.try_into().map_err(|_| CallError::Internal("a lease beyond all bounds".into()))?;
+            Ok(to_proto::session(guard.id().to_string(), lease, &*guard))
+        });
+        Ok(Response::new(session.await?))
+    }
+
+    async fn reset(&self, request: Request<pb::ResetRequest>) -> Result<Response<pb::ResetResponse>, Status> {
+        let request = request.into_inner();
+        let guard = self.0.take(from_proto::session_id(&request.session_id)?)?;
+        let work = interact::run(guard, move |batch| {
+            let (seeds, mask) = from_proto::reset(&request)?;
+            Ok(to_proto::reset(batch.reset(seeds, mask)?))
+        });
+        Ok(Response::new(work.await?.1?))
+    }
+
+    async fn step(&self, request: Request<pb::StepRequest>) -> Result<Response<pb::StepResponse>, Status> {
+        let request = request.into_inner();
+        let guard = self.0.take(from_proto::session_id(&request.session_id)?)?;
+        let work = interact::run(guard, move |batch| Ok(to_proto::step(batch.step(&request.actions)?)));
+        Ok(Response::new(work.await?.1?))
+    }
+
+    async fn interact(
+        &self,
+        request: Request<Streaming<pb::InteractRequest>>,
+    ) -> Result<Response<Self::InteractStream>, Status> {
+        Ok(Response::new(Box::pin(interact::interact(Arc::clone(&self.0), request.into_inner()))))
+    }
+
+    async fn rollout(&self, request: Request<pb::RolloutRequest>) -> Result<Response<Self::RolloutStream>, Status> {
+        let (mut request, host) = (request.into_inner(), &self.0);
+        let options = from_proto::options(request.options.take())?;
+        let environment = host.registry.configure(&request.env_id, &options).map_err(CallError::from)?;
+        let limits = RolloutLimits {
+            max_steps: host.config.max_rollout_steps,
+            max_message_bytes: host.config.max_message_bytes,
+        };
+        let plan = from_proto::rollout(&request, environment.spec(), &limits)?;
+        let permit = Arc::clone(&host.rollouts).try_acquire_owned().map_err(|_| {
+            let limit = host.config.max_concurrent_rollouts as u64;
+            CallError::Limit { field: "rollouts", what: "roll-outs at a time", limit, asked: limit + 1 }
+        })?;
+        let (sender, receiver) = mpsc::channel(WAITING_CHUNKS);
+        tokio::task::spawn_blocking(move || {
+            let _permit = permit;
+            // Sending waits for the reader and fails once it has gone.
+            let mut emit = |chunk| sender.blocking_send(Ok(to_proto::episodes(&chunk))).is_ok();
+            environment.roll_out(&plan, &|| sender.is_closed(), &mut emit);
+        });
+        Ok(Response::new(Box::pin(ReceiverStream::new(receiver))))
+    }
+
+    async fn get_model(&self, request: Request<pb::GetModelRequest>) -> Result<Response<Self::GetModelStream>, Status> {
+        let request = request.into_inner();
+        let model = self.0.model(request.env_id, from_proto::options(request.options)?).await?;
+        let parts = to_proto::model_parts(model).map(|part| Ok(pb::GetModelResponse { part: Some(part) }));
+        Ok(Response::new(stream::iter(parts).boxed()))
+    }
+
+    async fn render(&self, request: Request<pb::RenderRequest>) -> Result<Response<pb::RenderResponse>, Status> {
+        let request = request.into_inner();
+        let (id, mode) = (from_proto::session_id(&request.session_id)?, from_proto::render_mode(request.mode)?);
+        let drawing = draw(&self.0, id, request.index as usize, mode).await?;
+        Ok(Response::new(finish(drawing, mode).await?))
+    }
+
+    async fn close_session(
+        &self,
+        request: Request<pb::CloseSessionRequest>,
+    ) -> Result<Response<pb::CloseSessionResponse>, Status> {
+        self.0.take(from_proto::session_id(&request.into_inner().session_id)?)?.close();
+        Ok(Response::new(pb::CloseSessionResponse {}))
+    }
+}
+
+/// Draws an environment of a session that is free or owned by a stream.
+async fn draw(host: &Arc<Host>, id: SessionId, index: usize, mode: RenderMode) -> Result<String, CallError> {
+    let busy = CallError::Session(SessionError::Busy);
+    match host.take(id) {
+        Ok(guard) => Ok(interact::draw(&*guard, index, mode)?),
+        Err(error) if error == busy => {
+            let owner = host.sessions.owner(id).and_then(|owner| owner.downcast::<DrawSender>().ok());
+            let owner = owner.ok_or_else(|| busy.clone())?;
+            let (reply, picture) = oneshot::channel();
+            owner.send(DrawJob { index, mode, reply }).await.map_err(|_| busy.clone())?;
+            Ok(picture.await.map_err(|_| busy)??)
+        }
+        Err(error) => Err(error),
+    }
+}
+
+async fn finish(drawing: String, mode: RenderMode) -> Result<pb::RenderResponse, CallError> {
+    if mode == RenderMode::Ansi {
+        return Ok(pb::RenderResponse { content: Bytes::from(drawing), width: 0, height: 0 });
+    }
+    blocking(move || {
+        let picture = picture::draw(&drawing, mode == RenderMode::Png).map_err(CallError::Internal)?;
+        Ok(pb::RenderResponse { content: picture.content.into(), width: picture.width, height: picture.height })
+    })
+    .await
+}

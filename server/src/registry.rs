@@ -1,0 +1,269 @@
+//! The catalogue: environments by id, configured by options, behind one face whatever their kind.
+//!
+//! Invariant: a tabular model is computed once for each environment and set of options, even where many ask at a time,
+//! and the cache is bounded. Deliberately absent: transports and sessions.
+
+use crate::{
+    batch::{Batch, BatchOptions, SimBatch},
+    rollout::{EpisodeChunk, RolloutPlan, roll_out},
+    sim::{Configured, EnvSpec, OptionError, Simulator, TabularModel, maze},
+};
+use serde_json::{Map, Value};
+use std::{
+    fmt,
+    sync::{Arc, Mutex, OnceLock, PoisonError},
+};
+
+/// Options by name.
+pub type Options = Map<String, Value>;
+
+/// Models kept at a time; the least recently used one goes first.
+const CACHED_MODELS: usize = 16;
+
+/// A configured environment.
+pub trait Environment: Send + Sync {
+    /// Its description under the options.
+    fn spec(&self) -> &Arc<EnvSpec>;
+    /// A batch that was never reset.
+    fn batch(&self, options: BatchOptions) -> Box<dyn Batch>;
+    /// Runs a checked plan; see [`roll_out`].
+    fn roll_out(
+        &self,
+        plan: &RolloutPlan,
+        cancelled: &(dyn Fn() -> bool + Sync),
+        emit: &mut dyn FnMut(EpisodeChunk) -> bool,
+    );
+    /// Computes the tabular model; may take seconds. [`Registry::model`] keeps it.
+    fn compute_model(&self) -> TabularModel;
+}
+
+struct Kind<S> {
+    configured: Configured<S>,
+    model: fn(&Configured<S>) -> TabularModel,
+}
+
+impl<S: Simulator> Environment for Kind<S> {
+    fn spec(&self) -> &Arc<EnvSpec> {
+        &self.configured.spec
+    }
+
+    fn batch(&self, options: BatchOptions) -> Box<dyn Batch> {
+        Box::new(SimBatch::new(&self.configured, options))
+    }
+
+    fn roll_out(
+        &self,
+        plan: &RolloutPlan,
+        cancelled: &(dyn Fn() -> bool + Sync),
+        emit: &mut dyn FnMut(EpisodeChunk) -> bool,
+    ) {
+        roll_out(&self.configured, plan, cancelled, emit);
+    }
+
+    fn compute_model(&self) -> TabularModel {
+        (self.model)(&self.configured)
+    }
+}
+
+type Configure = Box<dyn Fn(&Options) -> Result<Arc<dyn Environment>, OptionError> + Send + Sync>;
+
+struct Entry {
+    env_id: &'static str,
+    configure: Configure,
+}
+
+/// Why an environment cannot be had.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum RegistryError {
+    /// No such environment.
+    #[error("no environment {env_id:?}; there are {}", known.join(", "))]
+    UnknownEnvironment {
+        /// What came.
+        env_id: String,
+        /// What there is.
+        known: Vec<&'static str>,
+    },
+    /// A wrong option.
+    #[error("option {0}")]
+    Option(#[from] OptionError),
+}
+
+/// The catalogue, in alphabetical order of the ids.
+pub struct Registry {
+    entries: Vec<Entry>,
+    models: ModelCache,
+}
+
+impl Default for Registry {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+impl fmt::Debug for Registry {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_list().entries(self.env_ids()).finish()
+    }
+}
+
+impl Registry {
+    /// All environments of this crate.
+    pub fn new() -> Self {
+        let mut registry = Self { entries: Vec::new(), models: ModelCache::default() };
+        registry.register(maze::ENV_ID, maze::configure, Configured::<maze::Maze>::model);
+        registry
+    }
+
+    fn register<S: Simulator>(
+        &mut self,
+        env_id: &'static str,
+        configure: fn(&Options) -> Result<Configured<S>, OptionError>,
+        model: fn(&Configured<S>) -> TabularModel,
+    ) {
+        let configure: Configure =
+            Box::new(move |options| Ok(Arc::new(Kind { configured: configure(options)?, model }) as Arc<dyn Environment>));
+        self.entries.push(Entry { env_id, configure });
+        self.entries.sort_by_key(|entry| entry.env_id);
+    }
+
+    /// Ids in alphabetical order.
+    pub fn env_ids(&self) -> impl Iterator<Item = &'static str> {
+        self.entries.iter().map(|entry| entry.env_id)
+    }
+
+    /// An environment under options; those not given take their defaults.
+    ///
+    /// # Errors
+    /// No such environment, a wrong option.
+    pub fn configure(&self, env_id: &str, options: &Options) -> Result<Arc<dyn Environment>, RegistryError> {
+        let entry = self.entries.iter().find(|entry| entry.env_id == env_id);
+        let entry = entry.ok_or_else(|| RegistryError::UnknownEnvironment {
+            env_id: env_id.into(),
+            known: self.env_ids().collect(),
+        })?;
+        Ok((entry.configure)(options)?)
+    }
+
+    /// Every environment with default options, in alphabetical order.
+    pub fn specs(&self) -> Vec<Arc<EnvSpec>> {
+        let defaults = Options::new();
+        let configured = self.entries.iter().map(|entry| (entry.configure)(&defaults));
+        configured.map(|environment| Arc::clone(environment.expect("default options are valid").spec())).collect()
+    }
+
+    /// The tabular model of an environment, computed by the first who asks while the others wait.
+    ///
+    /// # Errors
+    /// No such environment, a wrong option.
+    pub fn model(&self, env_id: &str, options: &Options) -> Result<Arc<TabularModel>, RegistryError> {
+        let environment = self.configure(env_id, options)?;
+        let key = cache_key(environment.spec(), options);
+        Ok(self.models.get_or_compute(key, || environment.compute_model()))
+    }
+}
+
+/// The id and every option, given or default, numbers as floating point: equal for equal configurations.
+fn cache_key(spec: &EnvSpec, given: &Options) -> String {
+    fn canonical(value: &Value) -> Value {
+        match value {
+            Value::Number(number) => number.as_f64().map_or_else(|| value.clone(), Value::from),
+            Value::Array(items) => items.iter().map(canonical).collect(),
+            Value::Object(map) => map.iter().map(|(key, value)| (key.clone(), canonical(value))).collect(),
+            Value::Null | Value::Bool(_) | Value::String(_) => value.clone(),
+        }
+    }
+    let mut options: Options = spec.options.iter().map(|o| (o.name.to_owned(), canonical(&o.default))).collect();
+    options.extend(given.iter().map(|(name, value)| (name.clone(), canonical(value))));
+    format!("{} {}", spec.env_id, Value::Object(options))
+}
+
+/// Most recently used last.
+#[derive(Default)]
+struct ModelCache(Mutex<Vec<(String, Arc<OnceLock<Arc<TabularModel>>>)>>);
+
+impl ModelCache {
+    fn get_or_compute(&self, key: String, compute: impl FnOnce() -> TabularModel) -> Arc<TabularModel> {
+        let cell = {
+            let mut entries = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+            let entry = match entries.iter().position(|(known, _)| *known == key) {
+                Some(position) => entries.remove(position),
+                None => (key, Arc::default()),
+            };
+            let cell = Arc::clone(&entry.1);
+            if entries.len() == CACHED_MODELS {
+                entries.remove(0);
+            }
+            entries.push(entry);
+            cell
+        };
+        Arc::clone(cell.get_or_init(|| Arc::new(compute())))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::json;
+    use std::sync::atomic::{AtomicUsize, Ordering};
+
+    fn options(value: Value) -> Options {
+        value.as_object().expect("an object").clone()
+    }
+
+    fn any_model() -> TabularModel {
+        Registry::new().configure("Maze-v0", &Options::new()).expect("known").compute_model()
+    }
+
+    #[test]
+    fn ids_are_sorted_and_defaults_configure() {
+        let registry = Registry::new();
+        let ids: Vec<_> = registry.env_ids().collect();
+        assert!(ids.is_sorted());
+        assert_eq!(registry.specs().iter().map(|spec| spec.env_id).collect::<Vec<_>>(), ids);
+    }
+
+    #[test]
+    fn an_unknown_environment_names_the_known_ones() {
+        let error = Registry::new().configure("Maze-v9", &Options::new()).err().expect("refused");
+        assert!(error.to_string().contains("\"Maze-v9\"") && error.to_string().contains("Maze-v0"), "{error}");
+    }
+
+    #[test]
+    fn explicit_defaults_and_other_spellings_of_a_number_share_a_model() {
+        let registry = Registry::new();
+        let first = registry.model("Maze-v0", &Options::new()).expect("known");
+        let spelled = registry.model("Maze-v0", &options(json!({"slip": 0.3}))).expect("known");
+        assert!(Arc::ptr_eq(&first, &spelled));
+        let none = registry.model("Maze-v0", &options(json!({"slip": 0}))).expect("known");
+        let none_again = registry.model("Maze-v0", &options(json!({"slip": 0.0}))).expect("known");
+        assert!(Arc::ptr_eq(&none, &none_again) && !Arc::ptr_eq(&first, &none));
+    }
+
+    #[test]
+    fn concurrent_callers_compute_once() {
+        let (cache, model, computed) = (ModelCache::default(), any_model(), AtomicUsize::new(0));
+        std::thread::scope(|scope| {
+            for _ in 0..8 {
+                scope.spawn(|| {
+                    cache.get_or_compute("same".into(), || {
+                        computed.fetch_add(1, Ordering::Relaxed);
+                        model.clone()
+                    })
+                });
+            }
+        });
+        assert_eq!(computed.into_inner(), 1);
+    }
+
+    #[test]
+    fn the_cache_is_bounded_and_keeps_what_is_used() {
+        let (cache, model) = (ModelCache::default(), any_model());
+        let kept = cache.get_or_compute("kept".into(), || model.clone());
+        for i in 0..2 * CACHED_MODELS {
+            cache.get_or_compute(i.to_string(), || model.clone());
+            cache.get_or_compute("kept".into(), || unreachable!("it is in use"));
+        }
+        assert_eq!(cache.0.lock().expect("not poisoned").len(), CACHED_MODELS);
+        assert!(Arc::ptr_eq(&kept, &cache.get_or_compute("kept".into(), || unreachable!())));
+    }
+}

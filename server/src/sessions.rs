@@ -1,0 +1,356 @@
+//! Sessions: batches that live on the server under a lease, by unguessable ids.
+//!
+//! Invariants: limits are checked before anything is allocated; a batch is owned by one caller at a time, who takes it
+//! out of its slot and whose [`Guard`] puts it back, so that no step waits for a lock; a session outlives its last use
+//! by its lease and no longer. Deliberately absent: transports, clocks (callers pass the time) and timers (someone calls
+//! [`Sessions::reap`]).
+
+use crate::batch::Batch;
+use std::{
+    collections::{HashMap, VecDeque},
+    fmt,
+    ops::{Deref, DerefMut},
+    sync::{Arc, Mutex, MutexGuard, PoisonError},
+    time::{Duration, Instant},
+};
+
+/// Expired ids remembered, so that their callers learn what happened.
+const REMEMBERED_IDS: usize = 1024;
+
+/// What all sessions together may take.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Limits {
+    /// Sessions at a time.
+    pub max_sessions: usize,
+    /// Environments of one session.
+    pub max_envs_per_session: usize,
+    /// Environments of all sessions.
+    pub max_total_envs: usize,
+    /// Lease of a session that asks for none.
+    pub default_lease: Duration,
+    /// Longest lease.
+    pub max_lease: Duration,
+}
+
+/// Name of a session: 128 random bits, 32 hexadecimal digits.
+#[derive(Clone, Copy, PartialEq, Eq, Hash)]
+pub struct SessionId(u128);
+
+impl SessionId {
+    fn random() -> Result<Self, SessionError> {
+        let mut bits = [0; 16];
+        getrandom::fill(&mut bits).map_err(|error| SessionError::Entropy(error.to_string()))?;
+        Ok(Self(u128::from_le_bytes(bits)))
+    }
+
+    /// Reads what [`fmt::Display`] wrote; `None` for anything else.
+    pub fn parse(text: &str) -> Option<Self> {
+        let plain = text.len() == 32 && text.bytes().all(|b| matches!(b, b'0'..=b'9' | b'a'..=b'f'));
+        if plain { u128::from_str_radix(text, 16).ok().map(Self) } else { None }
+    }
+}
+
+impl fmt::Display for SessionId {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{:032x}", self.0)
+    }
+}
+
+impl fmt::Debug for SessionId {
+    /// Shows too little to take the session over from a log.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "SessionId({:08x}…)", self.0 >> 96)
+    }
+}
+
+/// Why a session cannot be had.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum SessionError {
+    /// No such session.
+    #[error("no such session")]
+    Unknown,
+    /// The lease ran out.
+    #[error("the session's lease has expired")]
+    Expired,
+    /// Another call owns it.
+    #[error("the session is in use by another call or stream")]
+    Busy,
+    /// A limit is reached.
+    #[error("expected at most {limit} {what}, asked for {asked}")]
+    Limit {
+        /// Field of the request that asks for it.
+        field: &'static str,
+        /// Of what.
+        what: &'static str,
+        /// The limit.
+        limit: u64,
+        /// What was asked for, with what is in use.
+        asked: u64,
+    },
+    /// A lease outside the bounds.
+    #[error("expected a lease above 0 and at most {max_secs} s, got {got_secs} s")]
+    Lease {
+        /// The longest.
+        max_secs: f64,
+        /// What came.
+        got_secs: f64,
+    },
+    /// The operating system gave no random numbers.
+    #[error("no random session id from the operating system: {0}")]
+    Entropy(String),
+}
+
+/// What lives in a slot.
+struct Slot {
+    /// `None` while a [`Guard`] owns it.
+    batch: Option<Box<dyn Batch>>,
+    /// What reaches the owner of a batch that is taken, if it listens.
+    owner: Option<OwnerHandle>,
+    num_envs: usize,
+    lease: Duration,
+    expires: Instant,
+}
+
+/// Lets others reach the owner of a taken session; whatever the adapter needs.
+pub type OwnerHandle = Arc<dyn std::any::Any + Send + Sync>;
+
+#[derive(Default)]
+struct Inner {
+    slots: HashMap<SessionId, Slot>,
+    total_envs: usize,
+    expired: VecDeque<SessionId>,
+}
+
+impl Inner {
+    fn remove(&mut self, id: SessionId) {
+        if let Some(slot) = self.slots.remove(&id) {
+            self.total_envs -= slot.num_envs;
+        }
+    }
+
+    fn expire(&mut self, id: SessionId) {
+        self.remove(id);
+        if self.expired.len() == REMEMBERED_IDS {
+            self.expired.pop_front();
+        }
+        self.expired.push_back(id);
+    }
+
+    fn slot(&mut self, id: SessionId, now: Instant) -> Result<&mut Slot, SessionError> {
+        // A lease counts from the last use: what is taken is in use.
+        if self.slots.get(&id).is_some_and(|slot| slot.batch.is_some() && slot.expires <= now) {
+            self.expire(id);
+        }
+        if self.slots.contains_key(&id) {
+            Ok(self.slots.get_mut(&id).expect("just seen"))
+        } else if self.expired.contains(&id) {
+            Err(SessionError::Expired)
+        } else {
+            Err(SessionError::Unknown)
+        }
+    }
+}
+
+/// All sessions of a server.
+pub struct Sessions {
+    limits: Limits,
+    inner: Mutex<Inner>,
+}
+
+impl fmt::Debug for Sessions {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Sessions").field("limits", &self.limits).field("len", &self.len()).finish()
+    }
+}
+
+impl Sessions {
+    /// No session yet.
+    pub fn new(limits: Limits) -> Self {
+        Self { limits, inner: Mutex::default() }
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Inner> {
+        self.inner.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Number of sessions.
+    pub fn len(&self) -> usize {
+        self.lock().slots.len()
+    }
+
+    /// True where there is none.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// Creates a session of `num_envs` environments, made by `make` once the limits allow it.
+    ///
+    /// # Errors
+    /// A limit, a lease out of bounds, no randomness.
+    pub fn create(
+        &self,
+        num_envs: usize,
+        lease: Option<Duration>,
+        now: Instant,
+        make: impl FnOnce() -> Box<dyn Batch>,
+    ) -> Result<(SessionId, Duration), SessionError> {
+        let Limits { max_sessions, max_envs_per_session, max_total_envs, default_lease, max_lease } = self.limits;
+        let lease = lease.unwrap_or(default_lease);
+        if lease.is_zero() || lease > max_lease {
+            return Err(SessionError::Lease { max_secs: max_lease.as_secs_f64(), got_secs: lease.as_secs_f64() });
+        }
+        let limit = |field, what, limit: usize, asked: usize| {
+            if asked <= limit {
+                Ok(())
+            } else {
+                Err(SessionError::Limit { field, what, limit: limit as u64, asked: asked as u64 })
+            }
+        };
+        limit("num_envs", "environments in a session", max_envs_per_session, num_envs)?;
+        let id = SessionId::random()?;
+        {
+            let mut inner = self.lock();
+            limit("env_id", "sessions on this server", max_sessions, inner.slots.len() + 1)?;
+            limit("num_envs", "environments on this server", max_total_envs, inner.total_envs.saturating_add(num_envs))?;
+            inner.total_envs += num_envs;
+            inner.slots.insert(id, Slot { batch: None, owner: None, num_envs, lease, expires: now + lease });
+        }
+        // The slot is reserved: the batch, which may be large, is made without the lock. Should that panic, the slot goes.
+        let reserved = Reserved { sessions: self, id };
+        let batch = make();
+        std::mem::forget(reserved);
+        if let Some(slot) = self.lock().slots.get_mut(&id) {
+            slot.batch = Some(batch);
+        }
+        Ok((id, lease))
+    }
+
+    /// Takes the batch out of its slot until the guard is dropped. `owner` lets others reach the taker, through
+    /// [`Self::owner`].
+    ///
+    /// # Errors
+    /// Unknown, expired or in use.
+    pub fn take(
+        self: &Arc<Self>,
+        id: SessionId,
+        now: Instant,
+        owner: Option<OwnerHandle>,
+    ) -> Result<Guard, SessionError> {
+        let mut inner = self.lock();
+        let slot = inner.slot(id, now)?;
+        let batch = slot.batch.take().ok_or(SessionError::Busy)?;
+        slot.owner = owner;
+        Ok(Guard { sessions: Arc::clone(self), id, lease: slot.lease, batch: Some(batch) })
+    }
+
+    /// What the present taker of a session left to be reached by; `None` where nobody has taken it or left nothing.
+    pub fn owner(&self, id: SessionId) -> Option<OwnerHandle> {
+        self.lock().slots.get(&id)?.owner.clone()
+    }
+
+    /// Ends the sessions whose lease has run out, and says how many they were.
+    pub fn reap(&self, now: Instant) -> usize {
+        let mut dropped = Vec::new();
+        let mut inner = self.lock();
+        let due: Vec<_> = inner
+            .slots
+            .iter()
+            .filter(|(_, slot)| slot.batch.is_some() && slot.expires <= now)
+            .map(|(id, _)| *id)
+            .collect();
+        for &id in &due {
+            // Batches are freed after the lock.
+            dropped.extend(inner.slots.get_mut(&id).and_then(|slot| slot.batch.take()));
+            inner.expire(id);
+        }
+        drop(inner);
+        due.len()
+    }
+
+    /// When the next session that nobody uses expires.
+    pub fn next_expiry(&self) -> Option<Instant> {
+        self.lock().slots.values().filter(|slot| slot.batch.is_some()).map(|slot| slot.expires).min()
+    }
+}
+
+struct Reserved<'a> {
+    sessions: &'a Sessions,
+    id: SessionId,
+}
+
+impl Drop for Reserved<'_> {
+    fn drop(&mut self) {
+        self.sessions.lock().remove(self.id);
+    }
+}
+
+/// A session taken by one caller. Dropping it puts the batch back under a fresh lease.
+pub struct Guard {
+    sessions: Arc<Sessions>,
+    id: SessionId,
+    lease: Duration,
+    batch: Option<Box<dyn Batch>>,
+}
+
+impl fmt::Debug for Guard {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_tuple("Guard").field(&self.id).finish()
+    }
+}
+
+impl Guard {
+    /// Its session.
+    pub fn id(&self) -> SessionId {
+        self.id
+    }
+
+    /// How long the session outlives its last use.
+    pub fn lease(&self) -> Duration {
+        self.lease
+    }
+
+    /// Ends the session.
+    pub fn close(mut self) {
+        self.batch = None;
+        self.sessions.lock().remove(self.id);
+    }
+
+    /// Ends the session and remembers that its lease ran out.
+    pub fn expire(mut self) {
+        self.batch = None;
+        self.sessions.lock().expire(self.id);
+    }
+}
+
+impl Deref for Guard {
+    type Target = dyn Batch;
+
+    fn deref(&self) -> &Self::Target {
+        self.batch.as_deref().expect("held until dropped")
+    }
+}
+
+impl DerefMut for Guard {
+    fn deref_mut(&mut self) -> &mut Self::Target {
+        self.batch.as_deref_mut().expect("held until dropped")
+    }
+}
+
+impl Drop for Guard {
+    fn drop(&mut self) {
+        if let Some(batch) = self.batch.take() {
+            let mut inner = self.sessions.lock();
+            // A batch whose step panicked may be in any state: its session ends.
+            if std::thread::panicking() {
+                inner.remove(self.id);
+            } else if let Some(slot) = inner.slots.get_mut(&self.id) {
+                slot.batch = Some(batch);
+                slot.owner = None;
+                slot.expires = Instant::now() + slot.lease;
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -6,7 +6,7 @@ use std::{net::SocketAddr, time::Duration};
 /// Everything that a server can be told. [`Config::default`] has the defaults of the flags.
 #[derive(Debug, Clone, PartialEq, clap::Args)]
 pub struct Config {
-    /// Sessions at a time; a further one is refused with RESOURCE_EXHAUSTED.
+    /// Sessions at a time; a further one is refused with `RESOURCE_EXHAUSTED`.
     #[arg(long, env = "MAZEWAY_MAX_SESSIONS", default_value_t = 1024, value_name = "N")]
     pub max_sessions: usize,
     /// Environments in one session.
@@ -24,7 +24,7 @@ pub struct Config {
     /// Largest message accepted or sent, in bytes.
     #[arg(long, env = "MAZEWAY_MAX_MESSAGE_BYTES", default_value_t = 16 << 20, value_name = "BYTES")]
     pub max_message_bytes: usize,
-    /// Roll-outs that run at a time; a further one is refused with RESOURCE_EXHAUSTED.
+    /// Roll-outs that run at a time; a further one is refused with `RESOURCE_EXHAUSTED`.
     #[arg(long, env = "MAZEWAY_MAX_CONCURRENT_ROLLOUTS", default_value_t = 8, value_name = "N")]
     pub max_concurrent_rollouts: usize,
     /// Steps of one roll-out in all, burn-in included.

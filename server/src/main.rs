@@ -2,10 +2,7 @@
 
 use clap::Parser as _;
 use mazeway_server::{config::Cli, serve};
-use std::{
-    io::Write as _,
-    process::ExitCode,
-};
+use std::{io::Write as _, process::ExitCode};
 use tokio::net::TcpListener;
 use tracing_subscriber::EnvFilter;
 
@@ -31,7 +28,11 @@ async fn run(cli: Cli) -> ExitCode {
     let listener = match TcpListener::bind(cli.listen).await {
         Ok(listener) => listener,
         Err(error) => {
-            return refuse(1, &format!("cannot listen on {}: {error}", cli.listen), "take a free port: --listen 127.0.0.1:0");
+            return refuse(
+                1,
+                &format!("cannot listen on {}: {error}", cli.listen),
+                "take a free port: --listen 127.0.0.1:0",
+            );
         }
     };
     let address = listener.local_addr().unwrap_or(cli.listen);

@@ -120,8 +120,9 @@ impl Registry {
         configure: fn(&Options) -> Result<Configured<S>, OptionError>,
         model: fn(&Configured<S>) -> TabularModel,
     ) {
-        let configure: Configure =
-            Box::new(move |options| Ok(Arc::new(Kind { configured: configure(options)?, model }) as Arc<dyn Environment>));
+        let configure: Configure = Box::new(move |options| {
+            Ok(Arc::new(Kind { configured: configure(options)?, model }) as Arc<dyn Environment>)
+        });
         self.entries.push(Entry { env_id, configure });
         self.entries.sort_by_key(|entry| entry.env_id);
     }
@@ -177,9 +178,12 @@ fn cache_key(spec: &EnvSpec, given: &Options) -> String {
     format!("{} {}", spec.env_id, Value::Object(options))
 }
 
+/// A key and its model, once it is computed.
+type CachedModel = (String, Arc<OnceLock<Arc<TabularModel>>>);
+
 /// Most recently used last.
 #[derive(Default)]
-struct ModelCache(Mutex<Vec<(String, Arc<OnceLock<Arc<TabularModel>>>)>>);
+struct ModelCache(Mutex<Vec<CachedModel>>);
 
 impl ModelCache {
     fn get_or_compute(&self, key: String, compute: impl FnOnce() -> TabularModel) -> Arc<TabularModel> {

@@ -20,12 +20,12 @@ const CANCEL_CHECK_STEPS: u32 = 4096;
 #[derive(Debug, Clone, PartialEq)]
 pub struct TabularPolicy {
     n_actions: usize,
-    /// Running sums of each row, shape (n_states, n_actions).
+    /// Running sums of each row, shape `(n_states, n_actions)`.
     cumulative: Vec<f64>,
 }
 
 impl TabularPolicy {
-    /// Checks π(a|s), shape (n_states, n_actions).
+    /// Checks π(a|s), shape `(n_states, n_actions)`.
     ///
     /// # Errors
     /// Another length, an entry that is negative or not finite, a row that does not sum to 1 within
@@ -212,7 +212,7 @@ struct Episode {
 pub struct EpisodeChunk {
     /// Rank of the first.
     pub first_episode: u32,
-    /// Steps of each, shape (episodes,).
+    /// Steps of each, shape `(episodes,)`.
     pub lengths: Vec<u32>,
     /// Tabular state before each step, episode after episode; empty where totals alone were asked for.
     pub states: Vec<u32>,
@@ -220,15 +220,15 @@ pub struct EpisodeChunk {
     pub actions: Vec<u32>,
     /// Reward of each step, likewise.
     pub rewards: Vec<f64>,
-    /// Tabular state after the last step of each, shape (episodes,).
+    /// Tabular state after the last step of each, shape `(episodes,)`.
     pub final_states: Vec<u32>,
-    /// The episode came to an end of its own, shape (episodes,).
+    /// The episode came to an end of its own, shape `(episodes,)`.
     pub terminated: Vec<bool>,
-    /// Sum of each episode's rewards, shape (episodes,).
+    /// Sum of each episode's rewards, shape `(episodes,)`.
     pub returns: Vec<f64>,
     /// Names of the summed info columns.
     pub total_names: Vec<&'static str>,
-    /// Sums of each summed column, shape (columns, episodes).
+    /// Sums of each summed column, shape `(columns, episodes)`.
     pub totals: Vec<Vec<f64>>,
 }
 

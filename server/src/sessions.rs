@@ -159,7 +159,7 @@ pub struct Sessions {
 
 impl fmt::Debug for Sessions {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("Sessions").field("limits", &self.limits).field("len", &self.len()).finish()
+        f.debug_struct("Sessions").field("limits", &self.limits).field("len", &self.len()).finish_non_exhaustive()
     }
 }
 
@@ -211,7 +211,12 @@ impl Sessions {
         {
             let mut inner = self.lock();
             limit("env_id", "sessions on this server", max_sessions, inner.slots.len() + 1)?;
-            limit("num_envs", "environments on this server", max_total_envs, inner.total_envs.saturating_add(num_envs))?;
+            limit(
+                "num_envs",
+                "environments on this server",
+                max_total_envs,
+                inner.total_envs.saturating_add(num_envs),
+            )?;
             inner.total_envs += num_envs;
             inner.slots.insert(id, Slot { batch: None, owner: None, num_envs, lease, expires: now + lease });
         }
@@ -294,7 +299,7 @@ pub struct Guard {
 
 impl fmt::Debug for Guard {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_tuple("Guard").field(&self.id).finish()
+        f.debug_struct("Guard").field("id", &self.id).finish_non_exhaustive()
     }
 }
 

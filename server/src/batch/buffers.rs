@@ -33,11 +33,11 @@ pub struct Layout {
     pub num_envs: usize,
     /// Shape (num_envs, ...), as the observation space packs.
     pub observations: Range<usize>,
-    /// Float64, shape (num_envs,).
+    /// Float64, shape `(num_envs,)`.
     pub rewards: Range<usize>,
-    /// Flags, shape (num_envs,).
+    /// Flags, shape `(num_envs,)`.
     pub terminated: Range<usize>,
-    /// Flags, shape (num_envs,).
+    /// Flags, shape `(num_envs,)`.
     pub truncated: Range<usize>,
     /// One array a column, in the order of the columns.
     pub infos: Vec<Range<usize>>,
@@ -115,12 +115,12 @@ impl StepBuffers {
         self.has_final
     }
 
-    /// Packed observations, shape (num_envs, ...).
+    /// Packed observations, shape `(num_envs, ...)`.
     pub fn observations(&self) -> &[u8] {
         &self.bytes[self.layout.observations.clone()]
     }
 
-    /// Packed rewards, float64, shape (num_envs,).
+    /// Packed rewards, float64, shape `(num_envs,)`.
     pub fn rewards(&self) -> &[u8] {
         &self.bytes[self.layout.rewards.clone()]
     }
@@ -132,22 +132,22 @@ impl StepBuffers {
         f64::from_le_bytes(bits)
     }
 
-    /// Flags, shape (num_envs,).
+    /// Flags, shape `(num_envs,)`.
     pub fn terminated(&self) -> &[u8] {
         &self.bytes[self.layout.terminated.clone()]
     }
 
-    /// Flags, shape (num_envs,).
+    /// Flags, shape `(num_envs,)`.
     pub fn truncated(&self) -> &[u8] {
         &self.bytes[self.layout.truncated.clone()]
     }
 
-    /// Packed values of one info column, shape (num_envs, ...).
+    /// Packed values of one info column, shape `(num_envs, ...)`.
     pub fn info(&self, column: usize) -> &[u8] {
         &self.bytes[self.layout.infos[column].clone()]
     }
 
-    /// Last observations of ended episodes, zero elsewhere, shape (num_envs, ...); empty unless [`Self::has_final`].
+    /// Last observations of ended episodes, zero elsewhere, shape `(num_envs, ...)`; empty unless [`Self::has_final`].
     pub fn final_observations(&self) -> &[u8] {
         if self.has_final { &self.bytes[self.layout.final_observations.clone()] } else { &[] }
     }

@@ -48,7 +48,7 @@ pub enum Seeds<'a> {
     Continue,
     /// Environment i with seed + i, wrapping around.
     From(u64),
-    /// A seed an environment: packed uint64, little-endian, shape (num_envs,).
+    /// A seed an environment: packed uint64, little-endian, shape `(num_envs,)`.
     Each(&'a [u8]),
 }
 
@@ -62,12 +62,12 @@ pub trait Batch: Send {
     fn options(&self) -> BatchOptions;
     /// The reply to the latest reset or step.
     fn buffers(&self) -> &StepBuffers;
-    /// Begins new episodes where `mask` (uint8 flags, shape (num_envs,)) says, or everywhere.
+    /// Begins new episodes where `mask` (uint8 flags, shape `(num_envs,)`) says, or everywhere.
     ///
     /// # Errors
     /// Wrong lengths and flags; a mask that leaves out an environment that was never reset.
     fn reset(&mut self, seeds: Seeds<'_>, mask: Option<&[u8]>) -> Result<&StepBuffers, BatchError>;
-    /// Steps every environment once; `actions` are packed int32, little-endian, shape (num_envs,).
+    /// Steps every environment once; `actions` are packed int32, little-endian, shape `(num_envs,)`.
     ///
     /// # Errors
     /// Wrong length, action out of range, no reset yet, an ended episode where autoreset is disabled.
@@ -124,8 +124,7 @@ impl<S: Simulator> SimBatch<S> {
     pub fn new(configured: &Configured<S>, options: BatchOptions) -> Self {
         let spec = Arc::clone(&configured.spec);
         let columns = buffers::info_columns(&spec, options.action_masks);
-        let slot =
-            Slot { simulator: configured.prototype.clone(), rng: None, elapsed_steps: 0, phase: Phase::Unborn };
+        let slot = Slot { simulator: configured.prototype.clone(), rng: None, elapsed_steps: 0, phase: Phase::Unborn };
         let layout = Layout::new(&spec, &columns, options);
         Self {
             spec,

@@ -67,7 +67,8 @@ pub fn create_session(request: pb::CreateSessionRequest) -> Result<NewSession, C
         }
     };
     let lease = request.lease.map(Duration::try_from).transpose();
-    let lease = lease.map_err(|error| CallError::malformed("lease", format!("expected a positive duration: {error}")))?;
+    let lease =
+        lease.map_err(|error| CallError::malformed("lease", format!("expected a positive duration: {error}")))?;
     Ok(NewSession {
         env_id: request.env_id,
         options: options(request.options)?,

@@ -57,8 +57,7 @@ impl Host {
             return Err(CallError::Limit { field: "num_envs", what, limit: limit as u64, asked: reply_bytes as u64 });
         }
         let now = Instant::now();
-        let (id, lease) =
-            self.sessions.create(asked.num_envs, asked.lease, now, || environment.batch(options))?;
+        let (id, lease) = self.sessions.create(asked.num_envs, asked.lease, now, || environment.batch(options))?;
         Ok((self.sessions.take(id, now, None)?, lease))
     }
 

@@ -22,7 +22,7 @@ static FONTS: LazyLock<Arc<fontdb::Database>> = LazyLock::new(|| {
 
 /// A rasterised picture.
 pub struct Picture {
-    /// A PNG file, or raw RGB bytes, shape (height, width, 3).
+    /// A PNG file, or raw RGB bytes, shape `(height, width, 3)`.
     pub content: Vec<u8>,
     pub width: u32,
     pub height: u32,
@@ -30,8 +30,7 @@ pub struct Picture {
 
 /// Rasterises an SVG document on white.
 pub fn draw(svg: &str, png: bool) -> Result<Picture, String> {
-    let options =
-        Options { fontdb: Arc::clone(&FONTS), font_family: "Ubuntu".into(), ..Options::default() };
+    let options = Options { fontdb: Arc::clone(&FONTS), font_family: "Ubuntu".into(), ..Options::default() };
     let tree = Tree::from_str(svg, &options).map_err(|error| format!("the drawing is no SVG: {error}"))?;
     let size = tree.size().to_int_size();
     let (width, height) = (size.width(), size.height());

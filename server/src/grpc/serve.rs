@@ -29,7 +29,11 @@ pub enum ServeError {
 ///
 /// # Errors
 /// The transport fails.
-pub async fn serve(config: Config, listener: TcpListener, shutdown: impl Future<Output = ()>) -> Result<(), ServeError> {
+pub async fn serve(
+    config: Config,
+    listener: TcpListener,
+    shutdown: impl Future<Output = ()>,
+) -> Result<(), ServeError> {
     let stopping = CancellationToken::new();
     // Whatever way this ends, the reaper and the streams learn of it.
     let _stop = stopping.clone().drop_guard();

@@ -36,12 +36,8 @@ fn space(space: &Space) -> pb::Space {
         Space::Discrete { n } => discrete(*n),
         Space::Box { shape, low, high } => {
             let pack = |values: &[f32]| values.iter().flat_map(|value| value.to_le_bytes()).collect();
-            let space = pb::BoxSpace {
-                shape: shape.clone(),
-                dtype: dtype(DType::Float32),
-                low: pack(low),
-                high: pack(high),
-            };
+            let space =
+                pb::BoxSpace { shape: shape.clone(), dtype: dtype(DType::Float32), low: pack(low), high: pack(high) };
             pb::Space { kind: Some(pb::space::Kind::Box(space)) }
         }
     }

@@ -11,9 +11,9 @@ use plotters::style::text_anchor::{HPos, Pos, VPos};
 use std::cell::RefCell;
 
 /// Coordinates of the backend to a unit of the picture.
-pub(super) const UNITS: f64 = 10.0;
+const UNITS: f64 = 10.0;
 /// The last that is found decides; PNG are drawn with an embedded Ubuntu.
-pub(super) const FONT: &str = "Inter, 'Segoe UI', Roboto, Ubuntu, 'Helvetica Neue', Arial, sans-serif";
+const FONT: &str = "Inter, 'Segoe UI', Roboto, Ubuntu, 'Helvetica Neue', Arial, sans-serif";
 /// plotters divides font sizes by this.
 const FONT_FACTOR: f64 = 1.24;
 
@@ -94,18 +94,6 @@ impl Canvas<'_> {
         if let Err(error) = result {
             self.failure.borrow_mut().get_or_insert(error.to_string());
         }
-    }
-
-    /// Lets a chart of plotters draw into a part of the sheet.
-    pub(super) fn chart<E: std::fmt::Display>(
-        &self,
-        (x, y, width, height): (f64, f64, f64, f64),
-        chart: impl FnOnce(&Area<'_>) -> Result<(), E>,
-    ) {
-        let (left, top) = at(x, y);
-        let (width, height) = at(width, height);
-        let part = self.area.clone().shrink((left, top), (width, height));
-        self.note(chart(&part));
     }
 
     pub(super) fn rect(&self, x: f64, y: f64, width: f64, height: f64, fill: RGBColor) {

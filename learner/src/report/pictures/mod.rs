@@ -5,9 +5,12 @@
 
 mod canvas;
 mod colour;
+mod finite;
 mod grid;
+mod highway;
 mod panel;
 mod raster;
+mod trace;
 
 use super::{Report, ReportError};
 pub use raster::png;
@@ -49,7 +52,11 @@ pub struct Picture {
 pub fn all(report: &Report) -> Result<Vec<Picture>, ReportError> {
     report.check()?;
     let mut pictures = grid::pictures(report)?;
-    let _ = &mut pictures;
+    pictures.extend(highway::pictures(report)?);
+    if report.grid.is_none() {
+        pictures.extend(finite::pictures(report, !report.is_highway())?);
+    }
+    pictures.extend(trace::picture(report)?);
     Ok(pictures)
 }
 

@@ -1,0 +1,179 @@
+//! Any finite process: states by actions as a heat map, the states visited most where there are many.
+
+use super::canvas::{Canvas, Type, fit, text_width};
+use super::colour::{ACCENT, EMPTY, MUTED, RULE, Scale};
+use super::panel::{BAR, MARGIN, TITLE, WIDTH, bar, title};
+use super::{Part, Picture};
+use crate::report::format::{alike, count};
+use crate::report::{Report, ReportError};
+use plotters::style::Color;
+
+/// States and actions drawn at most.
+const MOST_STATES: usize = 60;
+const MOST_ACTIONS: usize = 24;
+/// Room for names.
+const STATE_NAMES: f64 = 120.0;
+const SET: f64 = 10.5;
+
+/// What all pictures of a process share.
+struct Layout {
+    states: Vec<usize>,
+    actions: Vec<usize>,
+    all: bool,
+    row: f64,
+    column: f64,
+    names: f64,
+}
+
+impl Layout {
+    fn new(report: &Report) -> Self {
+        let (states, all_states) = report.leading_states(MOST_STATES);
+        let mut actions: Vec<usize> = (0..report.actions()).collect();
+        // Actions that the policy takes most often come first where not all have room.
+        let weight =
+            |action: usize| -> f64 { states.iter().map(|&s| report.policy[s * report.actions() + action]).sum() };
+        if actions.len() > MOST_ACTIONS {
+            actions.sort_by(|&i, &j| weight(j).total_cmp(&weight(i)).then(i.cmp(&j)));
+            actions.truncate(MOST_ACTIONS);
+            actions.sort_unstable();
+        }
+        let all = all_states && actions.len() == report.actions();
+        let column = ((WIDTH - 2.0 * MARGIN - STATE_NAMES) / actions.len().max(1) as f64).min(80.0);
+        let row = if states.len() > 20 { 15.0 } else { 22.0 };
+        let longest = actions.iter().map(|&a| text_width(&report.action_name(a, 22), SET)).fold(0.0, f64::max);
+        Self { states, actions, all, row, column, names: if longest < column - 4.0 { 20.0 } else { longest + 12.0 } }
+    }
+
+    fn height(&self) -> f64 {
+        self.row * self.states.len() as f64
+    }
+
+    fn note(&self, report: &Report, what: &str) -> String {
+        if self.all {
+            return what.to_owned();
+        }
+        let (states, actions) = (self.states.len(), self.actions.len());
+        let (of_states, of_actions) = (f64::from(report.n_states), f64::from(report.n_actions));
+        match (states < report.states(), actions < report.actions()) {
+            (true, false) => format!("{what}; the {states} states visited most of {}", count(of_states)),
+            (false, _) => format!("{what}; the {actions} actions taken most of {}", count(of_actions)),
+            (true, true) => {
+                format!("{what}; {states} of {} states, {actions} of {} actions", count(of_states), count(of_actions))
+            }
+        }
+    }
+
+    /// Names of the states, `top` being the upper edge of the first row.
+    fn state_names(&self, canvas: &Canvas<'_>, report: &Report, top: f64) {
+        for (i, &state) in self.states.iter().enumerate() {
+            let name = fit(&report.state_name(state, 60), SET, STATE_NAMES - 8.0);
+            let colour = if report.visited(state) { super::colour::INK } else { MUTED };
+            let y = top + (i as f64 + 0.5) * self.row;
+            canvas.text(MARGIN + STATE_NAMES - 8.0, y, &name, Type::new(SET).right().colour(colour));
+        }
+    }
+}
+
+/// Reward and policy over states and actions, and visits where `visits` is set.
+pub(super) fn pictures(report: &Report, visits: bool) -> Result<Vec<Picture>, ReportError> {
+    let layout = Layout::new(report);
+    let mut pictures = vec![
+        pairs(
+            report,
+            &layout,
+            ("policy_table", "Policy", "probability of each action"),
+            &report.policy,
+            Scale::from_zero([1.0]),
+            "The probability with which the learned policy, as it explains the demonstrations, takes each action; each row sums to 1.",
+        )?,
+        pairs(
+            report,
+            &layout,
+            ("reward_table", "Reward", "learned reward of each action"),
+            &report.reward,
+            Scale::from_zero(report.reward.iter().copied()),
+            "The learned reward of each action in each state. A reward is known up to its scale only; names in grey are states \
+             that the demonstrations do not visit.",
+        )?,
+    ];
+    if visits {
+        pictures.push(bars(report, &layout)?);
+    }
+    Ok(pictures)
+}
+
+fn pairs(
+    report: &Report,
+    layout: &Layout,
+    (name, heading, what): (&'static str, &'static str, &str),
+    values: &[f64],
+    scale: Scale,
+    caption: &str,
+) -> Result<Picture, ReportError> {
+    let size = (WIDTH, TITLE + layout.names + layout.height() + BAR);
+    let note = layout.note(report, what);
+    let svg = Canvas::draw(name, size, &format!("{heading}: {note}"), |canvas| {
+        title(canvas, MARGIN, 0.0, WIDTH - 2.0 * MARGIN, heading, &note);
+        let (left, top) = (MARGIN + STATE_NAMES, TITLE + layout.names);
+        for (j, &action) in layout.actions.iter().enumerate() {
+            let (x, text) = (left + (j as f64 + 0.5) * layout.column, report.action_name(action, 22));
+            let set = Type::new(SET).colour(MUTED);
+            if text_width(&text, SET) < layout.column - 4.0 && layout.names <= 20.0 {
+                canvas.text(x, top - 10.0, &text, set.centred());
+            } else {
+                canvas.text(x, top - 6.0, &text, set.upright());
+            }
+        }
+        layout.state_names(canvas, report, top);
+        let write = alike(values.iter().copied());
+        for (i, &state) in layout.states.iter().enumerate() {
+            for (j, &action) in layout.actions.iter().enumerate() {
+                let value = values[state * report.actions() + action];
+                let (x, y) = (left + j as f64 * layout.column, top + i as f64 * layout.row);
+                canvas.rect(x, y, layout.column, layout.row, scale.colour(value));
+                let text = write(value);
+                if value != 0.0 && text_width(&text, 10.0) < layout.column - 4.0 && layout.row > 12.0 {
+                    let set = Type::new(10.0).centred().colour(scale.ink(value));
+                    canvas.text(x + layout.column / 2.0, y + layout.row / 2.0, &text, set);
+                }
+            }
+        }
+        let width = layout.column * layout.actions.len() as f64;
+        canvas.outline(left, top, width, layout.height(), RULE, 0.8);
+        for j in 1..layout.actions.len() {
+            let x = left + j as f64 * layout.column;
+            canvas.path(&[(x, top), (x, top + layout.height())], EMPTY, 0.8);
+        }
+        bar(canvas, left, top + layout.height(), WIDTH - MARGIN - left, &scale, &heading.to_lowercase(), false);
+    })?;
+    Ok(Picture { name, part: Part::Learned, title: heading, caption: caption.to_owned(), svg })
+}
+
+/// Visits of each state.
+fn bars(report: &Report, layout: &Layout) -> Result<Picture, ReportError> {
+    let size = (WIDTH, TITLE + layout.height() + MARGIN);
+    let note = layout.note(report, "steps of the demonstrations in each state");
+    let svg = Canvas::draw("visits", size, &format!("Visits: {note}"), |canvas| {
+        title(canvas, MARGIN, 0.0, WIDTH - 2.0 * MARGIN, "Visits", &note);
+        layout.state_names(canvas, report, TITLE);
+        let left = MARGIN + STATE_NAMES;
+        let scale = Scale::from_zero(layout.states.iter().map(|&state| report.state_visits[state]));
+        for (i, &state) in layout.states.iter().enumerate() {
+            let value = report.state_visits[state];
+            let share = if value.is_finite() { (value / scale.high).clamp(0.0, 1.0) } else { 0.0 };
+            let length = share * (WIDTH - MARGIN - left - 52.0);
+            let y = TITLE + i as f64 * layout.row;
+            let bar = [
+                (left, y + 2.0),
+                (left + length, y + 2.0),
+                (left + length, y + layout.row - 2.0),
+                (left, y + layout.row - 2.0),
+            ];
+            canvas.polygon(&bar, ACCENT.mix(1.0));
+            canvas.text(left + length + 6.0, y + layout.row / 2.0, &count(value), Type::new(SET).colour(MUTED));
+        }
+        canvas.path(&[(left, TITLE), (left, TITLE + layout.height())], MUTED, 0.8);
+    })?;
+    let caption = "How often the demonstrations visit each state: all that the learner knows of the expert.".to_owned();
+    Ok(Picture { name: "visits", part: Part::Seen, title: "Visits", caption, svg })
+}

@@ -4,8 +4,10 @@
 //! [`statistics`], [`irl`], [`eval`]) knows no storage and no transport and compiles without the feature `service`.
 
 pub mod irl;
+pub mod mdp;
 #[cfg(feature = "service")]
 pub mod report;
+pub mod statistics;
 pub mod trajectory;
 
 #[cfg(feature = "service")]

@@ -119,3 +119,56 @@ impl Trajectory {
         }
     }
 }
+
+/// Trajectories in the order in which they were given, whole: for methods whose sufficient statistics are the trajectories
+/// themselves.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct Demonstrations(Vec<Trajectory>);
+
+impl Demonstrations {
+    /// Keeps trajectories.
+    #[must_use]
+    pub fn new(trajectories: Vec<Trajectory>) -> Self {
+        Self(trajectories)
+    }
+
+    /// Adds one.
+    pub fn push(&mut self, trajectory: Trajectory) {
+        self.0.push(trajectory);
+    }
+
+    /// The trajectories.
+    pub fn trajectories(&self) -> &[Trajectory] {
+        &self.0
+    }
+
+    /// One after the other.
+    pub fn iter(&self) -> std::slice::Iter<'_, Trajectory> {
+        self.0.iter()
+    }
+
+    /// Number of trajectories.
+    pub fn len(&self) -> usize {
+        self.0.len()
+    }
+
+    /// True where there is none.
+    pub fn is_empty(&self) -> bool {
+        self.0.is_empty()
+    }
+}
+
+impl<'a> IntoIterator for &'a Demonstrations {
+    type Item = &'a Trajectory;
+    type IntoIter = std::slice::Iter<'a, Trajectory>;
+
+    fn into_iter(self) -> Self::IntoIter {
+        self.iter()
+    }
+}
+
+impl FromIterator<Trajectory> for Demonstrations {
+    fn from_iter<I: IntoIterator<Item = Trajectory>>(trajectories: I) -> Self {
+        Self(trajectories.into_iter().collect())
+    }
+}

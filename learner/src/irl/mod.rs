@@ -3,134 +3,169 @@
 //! A method takes a [`Problem`] and returns a [`Fit`]. Stopping is a value: a fit that did not converge still gives its
 //! best. Deliberately absent: where the data come from and where the fit goes.
 
-use crate::trajectory::Trajectory;
+mod basis;
+mod bc;
+mod bounded;
+mod em;
+mod em_mixture;
+pub mod em_tied;
+pub mod nnls;
+mod options;
+mod simplex;
+mod temperature;
+
+pub use crate::mdp::{HorizonPrior, PlannerKind};
+pub use basis::{Basis, BasisError};
+pub use options::{BasisKind, FitOptions, MStep, Penalty, Responsibility};
+
+use crate::mdp::{PlanError, PlanOptions, TabularMdp};
+use crate::statistics::Statistics;
+use crate::trajectory::Demonstrations;
 use serde::{Deserialize, Serialize};
 use std::ops::ControlFlow;
+use std::time::Instant;
 
-/// Prior over the number of steps, SPEC §1.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum HorizonPrior {
-    /// (1 − γ) γ^(k−1), normalised over 1..K.
-    #[default]
-    Geometric,
-    /// 1/K.
-    Uniform,
+/// What a method is given.
+#[derive(Debug, Clone, Copy)]
+pub struct Problem<'a> {
+    /// The process that the expert acted in.
+    pub mdp: &'a TabularMdp,
+    /// How to fit.
+    pub options: &'a FitOptions,
+    /// Counts of what the expert did.
+    pub statistics: &'a Statistics,
+    /// The trajectories themselves, where [`Method::needs_demonstrations`] asks for them.
+    pub demonstrations: Option<&'a Demonstrations>,
 }
 
-/// Basis functions Φ of the reward.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum BasisKind {
-    /// Dirac on states, shape (n_states,).
-    #[default]
-    State,
-    /// Dirac on state-action pairs, shape (n_states * n_actions,).
-    StateAction,
+/// A way to learn a reward and a policy.
+pub trait Method: Sync {
+    /// Its name, as in "em-tied".
+    fn id(&self) -> &'static str;
+
+    /// One line about it.
+    fn description(&self) -> &'static str;
+
+    /// True where the counts are not enough and [`Problem::demonstrations`] must be there.
+    fn needs_demonstrations(&self) -> bool {
+        false
+    }
+
+    /// Fits; calls `progress` after every iteration.
+    ///
+    /// # Errors
+    /// Options or data that the method cannot work with, and cancellation by `progress`.
+    fn fit(&self, problem: &Problem<'_>, progress: Progress<'_>) -> Result<Fit, FitError>;
 }
 
-/// Reward step of `em`, SPEC §5.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum MStep {
-    /// Non-negative least squares, Hahn & Zoubir (2015) eq. 10.
-    #[default]
-    Nnls,
-    /// Exact maximiser of Q on the simplex.
-    Simplex,
+/// All methods, the default first.
+pub const METHODS: &[&dyn Method] = &[&em_tied::EmTied, &em::Em, &em_mixture::EmMixture, &bc::Bc];
+
+/// The method of a name.
+pub fn method(id: &str) -> Option<&'static dyn Method> {
+    METHODS.iter().copied().find(|method| method.id() == id)
 }
 
-/// Responsibilities of `em`, SPEC §5.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum Responsibility {
-    /// ρ_k = 1.
-    #[default]
-    Approximate,
-    /// The product of the rewards along the demonstrations, in log space.
-    Exact,
+/// Why there is no fit.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum FitError {
+    /// The progress callback said so.
+    #[error("the fit was cancelled")]
+    Cancelled,
+    /// An option outside its range, or one that does not go with the others.
+    #[error("{field}: {message}")]
+    InvalidOption {
+        /// Name of the field of [`FitOptions`].
+        field: &'static str,
+        /// What was expected and what came.
+        message: String,
+    },
+    /// Model and data belong to different processes.
+    #[error("expected statistics of {n_states} states and {n_actions} actions, got {got_states} states and {got_actions} actions")]
+    Mismatch {
+        /// States of the model.
+        n_states: usize,
+        /// Actions of the model.
+        n_actions: usize,
+        /// States of the data.
+        got_states: usize,
+        /// Actions of the data.
+        got_actions: usize,
+    },
+    /// A method that needs whole trajectories was given none.
+    #[error("method {method} needs the demonstrations themselves, got only their counts")]
+    NeedsDemonstrations {
+        /// Its name.
+        method: &'static str,
+    },
+    /// Too large to be solved in memory.
+    #[error("expected at most {limit} {what}, got {got}")]
+    TooLarge {
+        /// What there is too much of.
+        what: &'static str,
+        /// The limit.
+        limit: usize,
+        /// What came.
+        got: usize,
+    },
+    /// The planner refused.
+    #[error(transparent)]
+    Plan(#[from] PlanError),
 }
 
-/// Turns a reward into a policy.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum PlannerKind {
-    /// Value iteration.
-    #[default]
-    ValueIteration,
-    /// Policy iteration.
-    PolicyIteration,
-    /// Soft value iteration.
-    SoftValueIteration,
-    /// Toussaint & Storkey (2006).
-    ExpectationMaximization,
-}
-
-/// Penalty on the weights of `em-tied`, SPEC §6.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum Penalty {
-    /// strength · Σ w, w ≥ 0.
-    #[default]
-    L1,
-    /// strength / 2 · |w|², w free.
-    L2,
-    /// None, w free: maximum likelihood.
-    None,
-}
-
-/// Everything that decides a fit beside model and data.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(default)]
-pub struct FitOptions {
-    /// γ.
-    pub discount: f64,
-    /// K: steps of each trajectory that are used; `None`: the longest trajectory's.
-    pub horizon: Option<u32>,
-    /// p(k).
-    pub horizon_prior: HorizonPrior,
-    /// Φ.
-    pub basis: BasisKind,
-    /// Reward step of `em`.
-    pub m_step: MStep,
-    /// ρ_k of `em`.
-    pub responsibility: Responsibility,
-    /// Policy step.
-    pub planner: PlannerKind,
-    /// The basis function that eq. 10 takes as the reference.
-    pub reference_basis: u32,
-    /// Penalty of `em-tied`.
-    pub penalty: Penalty,
-    /// Strength of the penalty.
-    pub penalty_strength: f64,
-    /// Change of the objective below which a fit has converged.
-    pub tolerance: f64,
-    /// Iterations after which a fit stops all the same.
-    pub max_iterations: u32,
-    /// Pseudo-count of `bc`.
-    pub smoothing: f64,
-    /// Seed of methods that draw numbers.
-    pub seed: u64,
-}
-
-impl Default for FitOptions {
-    fn default() -> Self {
-        Self {
-            discount: 0.9,
-            horizon: None,
-            horizon_prior: HorizonPrior::default(),
-            basis: BasisKind::default(),
-            m_step: MStep::default(),
-            responsibility: Responsibility::default(),
-            planner: PlannerKind::default(),
-            reference_basis: 0,
-            penalty: Penalty::default(),
-            penalty_strength: 1.0,
-            tolerance: 1e-6,
-            max_iterations: 1000,
-            smoothing: 0.0,
-            seed: 0,
+impl Problem<'_> {
+    /// Checks all that the methods have in common.
+    fn check(&self) -> Result<(), FitError> {
+        let (mdp, statistics) = (self.mdp, self.statistics);
+        if (mdp.n_states(), mdp.n_actions()) != (statistics.n_states(), statistics.n_actions()) {
+            return Err(FitError::Mismatch {
+                n_states: mdp.n_states(),
+                n_actions: mdp.n_actions(),
+                got_states: statistics.n_states(),
+                got_actions: statistics.n_actions(),
+            });
         }
+        self.options.check()
+    }
+
+    /// K of the horizon prior, at least 1.
+    fn horizon(&self) -> u32 {
+        self.options.horizon.unwrap_or_else(|| self.statistics.longest())
+    }
+
+    fn basis(&self) -> Basis {
+        match self.options.basis {
+            BasisKind::State => Basis::state(self.mdp),
+            BasisKind::StateAction => Basis::state_action(self.mdp),
+        }
+    }
+
+    fn plan_options(&self) -> PlanOptions {
+        PlanOptions {
+            discount: self.options.discount,
+            horizon: Some(self.horizon()),
+            horizon_prior: self.options.horizon_prior,
+        }
+    }
+}
+
+/// Keeps the trace of a fit and tells its caller.
+struct Trace<'a> {
+    begun: Instant,
+    entries: Vec<TraceEntry>,
+    progress: Progress<'a>,
+}
+
+impl<'a> Trace<'a> {
+    fn new(progress: Progress<'a>) -> Self {
+        Self { begun: Instant::now(), entries: Vec::new(), progress }
+    }
+
+    fn record(&mut self, objective: f64, change: f64) -> Result<(), FitError> {
+        let iteration = self.entries.len() as u32 + 1;
+        let entry = TraceEntry { iteration, objective, change, elapsed_secs: self.begun.elapsed().as_secs_f64() };
+        self.entries.push(entry);
+        if (self.progress)(&entry).is_break() { Err(FitError::Cancelled) } else { Ok(()) }
     }
 }
 
@@ -164,17 +199,17 @@ pub struct TraceEntry {
 /// A learned reward and policy.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Fit {
-    /// w, shape (n_basis,).
+    /// w, shape (`n_basis`,).
     pub weights: Vec<f64>,
-    /// R(s,a), shape (n_states * n_actions,).
+    /// R(s,a), shape (`n_states * n_actions`,).
     pub reward: Vec<f64>,
-    /// The stochastic policy that explains the demonstrations, π(a|s), shape (n_states * n_actions,).
+    /// The stochastic policy that explains the demonstrations, π(a|s), shape (`n_states * n_actions`,).
     pub policy: Vec<f64>,
-    /// The greedy policy to act with, ties split evenly, shape (n_states * n_actions,).
+    /// The greedy policy to act with, ties split evenly, shape (`n_states * n_actions`,).
     pub greedy_policy: Vec<f64>,
-    /// V(s) under the reward and the planner, shape (n_states,).
+    /// V(s) under the reward and the planner, shape (`n_states`,).
     pub state_values: Vec<f64>,
-    /// Standard errors of the weights from the exact Hessian (unpenalised likelihood only), shape (n_basis,).
+    /// Standard errors of the weights from the exact Hessian (unpenalised likelihood only), shape (`n_basis`,).
     pub standard_errors: Option<Vec<f64>>,
     /// One entry an iteration.
     pub trace: Vec<TraceEntry>,
@@ -188,7 +223,3 @@ pub struct Fit {
 
 /// Called after every iteration; `Break` cancels the fit.
 pub type Progress<'a> = &'a mut dyn FnMut(&TraceEntry) -> ControlFlow<()>;
-
-/// Placeholder that keeps the import until [`Trajectory`] is used by the problem.
-#[doc(hidden)]
-pub type Demonstrations = Vec<Trajectory>;

@@ -1,0 +1,92 @@
+//! Log-likelihood of the soft-optimal policy with its exact gradient and Hessian.
+
+use crate::irl::Basis;
+use crate::mdp::{Resolvent, SoftSolver, TabularMdp, log_sum_exp};
+use nalgebra::DMatrix;
+
+/// ℓ(w) = Σ_{s,a} N(s,a) log π_w(a|s) of given counts. Warm-starts the soft values from one call to the next.
+pub struct Likelihood<'a> {
+    mdp: &'a TabularMdp,
+    basis: &'a Basis,
+    discount: f64,
+    /// N(s,a).
+    counts: Vec<f64>,
+    /// γ Σ_{s,a} N(s,a) P(·|s,a) − N(·): the derivative of ℓ with respect to V.
+    value_weights: Vec<f64>,
+    solver: SoftSolver<'a>,
+}
+
+impl<'a> Likelihood<'a> {
+    /// `counts` has shape (`n_states * n_actions`,).
+    ///
+    /// # Panics
+    /// Where `discount` is not in [0, 1).
+    pub fn new(mdp: &'a TabularMdp, basis: &'a Basis, counts: Vec<f64>, discount: f64) -> Self {
+        let mut value_weights: Vec<f64> = mdp.propagate(&counts).into_iter().map(|n| discount * n).collect();
+        for (weight, row) in value_weights.iter_mut().zip(counts.chunks_exact(mdp.n_actions())) {
+            *weight -= row.iter().sum::<f64>();
+        }
+        Self { mdp, basis, discount, counts, value_weights, solver: SoftSolver::new(mdp, discount) }
+    }
+
+    /// ℓ(w) and dℓ/dw, shape (`n_basis`,).
+    ///
+    /// With M = I − γP_π and Mᵀv = γ Σ N P − N, the derivative with respect to R(s,a) is N(s,a) + π(a|s) v(s): one solve.
+    pub fn value_and_gradient(&mut self, weights: &[f64]) -> (f64, Vec<f64>) {
+        self.solver.solve(&self.basis.reward(weights));
+        let n_actions = self.mdp.n_actions();
+        let q = self.solver.action_values().chunks_exact(n_actions);
+        let log_likelihood = q
+            .zip(self.counts.chunks_exact(n_actions))
+            .map(|(q, n)| {
+                let value = log_sum_exp(q);
+                q.iter().zip(n).map(|(q, n)| if *n > 0.0 { n * (q - value) } else { 0.0 }).sum::<f64>()
+            })
+            .sum();
+        let policy = self.solver.policy();
+        let v = Resolvent::new(self.mdp, policy, self.discount).solve_transposed(&self.value_weights);
+        let mut by_reward = self.counts.clone();
+        for (pair, (g, p)) in by_reward.iter_mut().zip(policy).enumerate() {
+            *g += p * v[pair / n_actions];
+        }
+        (log_likelihood, self.basis.project(&by_reward))
+    }
+
+    /// d²ℓ/dw², shape (`n_basis`, `n_basis`).
+    ///
+    /// With J_b = dV/dw_b = M⁻¹ Σ_a π Φ_b and g_b = dQ/dw_b = Φ_b + γ P J_b, the second derivative of V solves M V'' = Cov_π(g_b,
+    /// g_c) state by state, so d²ℓ/dw_b dw_c = Σ_s v(s) Cov_{a ~ π(s)}(g_b, g_c) with the v of the gradient.
+    pub fn hessian(&mut self, weights: &[f64]) -> DMatrix<f64> {
+        self.solver.solve(&self.basis.reward(weights));
+        let (mdp, n_basis, n_actions) = (self.mdp, self.basis.len(), self.mdp.n_actions());
+        let policy = self.solver.policy();
+        let resolvent = Resolvent::new(mdp, policy, self.discount);
+        let v = resolvent.solve_transposed(&self.value_weights);
+        let mut received = vec![vec![0.0; mdp.n_states()]; n_basis];
+        for (pair, &p) in policy.iter().enumerate() {
+            self.basis.for_each(pair, |b, value| received[b][pair / n_actions] += p * value);
+        }
+        let sensitivities: Vec<Vec<f64>> = received.iter().map(|b| resolvent.solve(b)).collect();
+        let mut hessian = DMatrix::zeros(n_basis, n_basis);
+        let mut centred = DMatrix::zeros(n_basis, n_actions);
+        for state in 0..mdp.n_states() {
+            for action in 0..n_actions {
+                let pair = mdp.pair(state, action);
+                for (b, sensitivity) in sensitivities.iter().enumerate() {
+                    centred[(b, action)] = self.discount * mdp.expected(pair, sensitivity) - sensitivity[state];
+                }
+                self.basis.for_each(pair, |b, value| centred[(b, action)] += value);
+            }
+            let weighted = DMatrix::from_fn(n_basis, n_actions, |b, action| {
+                v[state] * policy[mdp.pair(state, action)] * centred[(b, action)]
+            });
+            hessian.gemm(1.0, &weighted, &centred.transpose(), 1.0);
+        }
+        hessian
+    }
+
+    /// Soft values and policy of the weights last evaluated.
+    pub fn solver(&self) -> &SoftSolver<'a> {
+        &self.solver
+    }
+}

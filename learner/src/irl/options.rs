@@ -1,0 +1,132 @@
+//! What decides a fit beside model and data.
+
+use super::FitError;
+use crate::mdp::{HorizonPrior, PlannerKind};
+use serde::{Deserialize, Serialize};
+
+/// Basis functions Φ of the reward.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum BasisKind {
+    /// Dirac on states, shape (`n_states`,).
+    #[default]
+    State,
+    /// Dirac on state-action pairs, shape (`n_states * n_actions`,).
+    StateAction,
+}
+
+/// Reward step of `em`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum MStep {
+    /// Non-negative least squares, Hahn & Zoubir (2015) eq. 10.
+    #[default]
+    Nnls,
+    /// Exact maximiser of Q on the simplex.
+    Simplex,
+}
+
+/// Responsibilities of `em`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Responsibility {
+    /// ρ_k = 1.
+    #[default]
+    Approximate,
+    /// The product of the rewards along the demonstrations, in log space.
+    Exact,
+}
+
+/// Penalty on the weights of `em-tied`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Penalty {
+    /// strength · Σ w, w ≥ 0.
+    #[default]
+    L1,
+    /// strength / 2 · |w|², w free.
+    L2,
+    /// None, w free: maximum likelihood.
+    None,
+}
+
+/// Everything that decides a fit beside model and data.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct FitOptions {
+    /// γ.
+    pub discount: f64,
+    /// K: steps of each trajectory that are used; `None`: the longest trajectory's.
+    pub horizon: Option<u32>,
+    /// p(k).
+    pub horizon_prior: HorizonPrior,
+    /// Φ.
+    pub basis: BasisKind,
+    /// Reward step of `em`.
+    pub m_step: MStep,
+    /// ρ_k of `em`.
+    pub responsibility: Responsibility,
+    /// Policy step.
+    pub planner: PlannerKind,
+    /// The basis function that eq. 10 takes as the reference.
+    pub reference_basis: u32,
+    /// Penalty of `em-tied`.
+    pub penalty: Penalty,
+    /// Strength of the penalty.
+    pub penalty_strength: f64,
+    /// Change of the objective below which a fit has converged.
+    pub tolerance: f64,
+    /// Iterations after which a fit stops all the same.
+    pub max_iterations: u32,
+    /// Pseudo-count of `bc`.
+    pub smoothing: f64,
+    /// Seed of methods that draw numbers.
+    pub seed: u64,
+}
+
+impl Default for FitOptions {
+    fn default() -> Self {
+        Self {
+            discount: 0.9,
+            horizon: None,
+            horizon_prior: HorizonPrior::default(),
+            basis: BasisKind::default(),
+            m_step: MStep::default(),
+            responsibility: Responsibility::default(),
+            planner: PlannerKind::default(),
+            reference_basis: 0,
+            penalty: Penalty::default(),
+            penalty_strength: 1.0,
+            tolerance: 1e-6,
+            max_iterations: 1000,
+            smoothing: 0.0,
+            seed: 0,
+        }
+    }
+}
+
+impl FitOptions {
+    /// Checks every field that stands on its own.
+    pub(super) fn check(&self) -> Result<(), FitError> {
+        let invalid = |field, message| Err(FitError::InvalidOption { field, message });
+        if !(0.0..=1.0).contains(&self.discount) {
+            return invalid("discount", format!("expected a number in [0, 1], got {}", self.discount));
+        }
+        if self.horizon == Some(0) {
+            return invalid("horizon", "expected at least 1 step, got 0".to_owned());
+        }
+        if self.max_iterations == 0 {
+            return invalid("max_iterations", "expected at least 1 iteration, got 0".to_owned());
+        }
+        for (field, value) in [
+            ("penalty_strength", self.penalty_strength),
+            ("tolerance", self.tolerance),
+            ("smoothing", self.smoothing),
+        ] {
+            if !(value.is_finite() && value >= 0.0) {
+                return invalid(field, format!("expected a finite number that is not negative, got {value}"));
+            }
+        }
+        Ok(())
+    }
+}

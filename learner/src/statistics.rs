@@ -1,0 +1,185 @@
+//! Sufficient statistics of demonstrations, gathered one trajectory at a time.
+//!
+//! Memory is bounded by the model and the horizon, never by the amount of data: per step k = 1..K, the number of times each
+//! state-action pair was seen. All that depends on the discount or the horizon prior is derived from these at fit time.
+//! Deliberately absent: whole trajectories; the one method that needs them takes
+//! [`Demonstrations`](crate::trajectory::Demonstrations).
+
+use crate::mdp::TabularMdp;
+use crate::trajectory::Trajectory;
+use std::collections::BTreeMap;
+
+/// Gathers [`Statistics`].
+#[derive(Debug, Clone)]
+pub struct StatisticsBuilder {
+    n_states: usize,
+    n_actions: usize,
+    horizon: usize,
+    steps: Vec<BTreeMap<u32, u64>>,
+    n_trajectories: u64,
+}
+
+/// Why a trajectory or a model does not fit the statistics.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum StatisticsError {
+    /// The trajectory belongs to another process.
+    #[error("expected states below {n_states} and actions below {n_actions}, got state {state} and action {action} at step {step}")]
+    OutOfRange {
+        /// Number of states.
+        n_states: usize,
+        /// Number of actions.
+        n_actions: usize,
+        /// What came.
+        state: u32,
+        /// What came.
+        action: u32,
+        /// Position in the trajectory.
+        step: usize,
+    },
+    /// No trajectory was added.
+    #[error("expected at least one trajectory, got none")]
+    Empty,
+}
+
+impl StatisticsBuilder {
+    /// Counts the first `horizon` steps of each trajectory; all of them where `None`.
+    #[must_use]
+    pub fn new(n_states: usize, n_actions: usize, horizon: Option<u32>) -> Self {
+        let horizon = horizon.map_or(usize::MAX, |k| k.max(1) as usize);
+        Self { n_states, n_actions, horizon, steps: Vec::new(), n_trajectories: 0 }
+    }
+
+    /// Counts a trajectory.
+    ///
+    /// # Errors
+    /// An index outside the process; nothing of the trajectory is counted then.
+    pub fn add(&mut self, trajectory: &Trajectory) -> Result<(), StatisticsError> {
+        let (n_states, n_actions) = (self.n_states, self.n_actions);
+        let steps = || trajectory.states().iter().zip(trajectory.actions()).take(self.horizon).enumerate();
+        for (step, (&state, &action)) in steps() {
+            if state as usize >= n_states || action as usize >= n_actions {
+                return Err(StatisticsError::OutOfRange { n_states, n_actions, state, action, step });
+            }
+        }
+        if self.steps.len() < trajectory.len().min(self.horizon) {
+            self.steps.resize_with(trajectory.len().min(self.horizon), BTreeMap::new);
+        }
+        for (counts, (&state, &action)) in
+            self.steps.iter_mut().zip(trajectory.states().iter().zip(trajectory.actions()))
+        {
+            *counts.entry(state * n_actions as u32 + action).or_insert(0) += 1;
+        }
+        self.n_trajectories += 1;
+        Ok(())
+    }
+
+    /// Counts a whole collection.
+    ///
+    /// # Errors
+    /// As [`StatisticsBuilder::add`]; the trajectories before the wrong one stay counted.
+    pub fn extend<'a>(&mut self, trajectories: impl IntoIterator<Item = &'a Trajectory>) -> Result<(), StatisticsError> {
+        trajectories.into_iter().try_for_each(|trajectory| self.add(trajectory))
+    }
+
+    /// Ends the gathering.
+    ///
+    /// # Errors
+    /// No trajectory was added.
+    pub fn finish(self) -> Result<Statistics, StatisticsError> {
+        if self.n_trajectories == 0 {
+            return Err(StatisticsError::Empty);
+        }
+        let steps: Vec<Vec<(u32, f64)>> = self
+            .steps
+            .into_iter()
+            .map(|counts| counts.into_iter().map(|(pair, count)| (pair, count as f64)).collect())
+            .collect();
+        Ok(Statistics {
+            n_states: self.n_states,
+            n_actions: self.n_actions,
+            n_trajectories: self.n_trajectories,
+            steps,
+        })
+    }
+}
+
+/// Counts of demonstrated state-action pairs, per step. Invariant: at least one trajectory, hence at least one step.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Statistics {
+    n_states: usize,
+    n_actions: usize,
+    n_trajectories: u64,
+    /// Per step: rising pairs and their counts.
+    steps: Vec<Vec<(u32, f64)>>,
+}
+
+impl Statistics {
+    /// Starts to gather; see [`StatisticsBuilder::new`].
+    #[must_use]
+    pub fn builder(n_states: usize, n_actions: usize, horizon: Option<u32>) -> StatisticsBuilder {
+        StatisticsBuilder::new(n_states, n_actions, horizon)
+    }
+
+    /// Number of states.
+    pub fn n_states(&self) -> usize {
+        self.n_states
+    }
+
+    /// Number of actions.
+    pub fn n_actions(&self) -> usize {
+        self.n_actions
+    }
+
+    /// Number of trajectories L.
+    pub fn n_trajectories(&self) -> u64 {
+        self.n_trajectories
+    }
+
+    /// Length of the longest trajectory, cut at the builder's horizon; at least 1.
+    pub fn longest(&self) -> u32 {
+        self.steps.len() as u32
+    }
+
+    /// `N_k(s,a)` of step `k` = 0, 1, …: rising pairs and how often they were seen there; empty beyond the longest trajectory.
+    pub fn step_counts(&self, k: usize) -> &[(u32, f64)] {
+        self.steps.get(k).map_or(&[], Vec::as_slice)
+    }
+
+    /// Σ_{k < horizon} `weight(k)` `N_k(s,a)`, shape (`n_states * n_actions`,), with k from 0.
+    pub fn weighted_counts(&self, horizon: usize, mut weight: impl FnMut(usize) -> f64) -> Vec<f64> {
+        let mut counts = vec![0.0; self.n_states * self.n_actions];
+        for (k, step) in self.steps.iter().enumerate().take(horizon) {
+            let weight = weight(k);
+            for &(pair, count) in step {
+                counts[pair as usize] += weight * count;
+            }
+        }
+        counts
+    }
+
+    /// N(s,a) of the first `horizon` steps (all where `None`), shape (`n_states * n_actions`,).
+    pub fn counts(&self, horizon: Option<u32>) -> Vec<f64> {
+        self.weighted_counts(horizon.map_or(usize::MAX, |k| k as usize), |_| 1.0)
+    }
+
+    /// N(s) of the first `horizon` steps (all where `None`), shape (`n_states`,).
+    pub fn state_visits(&self, horizon: Option<u32>) -> Vec<f64> {
+        self.counts(horizon).chunks_exact(self.n_actions).map(|row| row.iter().sum()).collect()
+    }
+
+    /// Number of steps among the first `horizon` of each trajectory (all where `None`).
+    pub fn n_steps(&self, horizon: Option<u32>) -> u64 {
+        let horizon = horizon.map_or(usize::MAX, |k| k as usize);
+        self.steps.iter().take(horizon).flatten().map(|&(_, count)| count as u64).sum()
+    }
+
+    /// Number of states that the first `horizon` steps visit (all where `None`).
+    pub fn states_covered(&self, horizon: Option<u32>) -> usize {
+        self.state_visits(horizon).iter().filter(|&&n| n > 0.0).count()
+    }
+}
+
+/// Transition-side sum Σ_{s,a} N(s,a) P(s'|s,a): how often the model expects each state to follow, shape (`n_states`,).
+pub fn expected_arrivals(mdp: &TabularMdp, counts: &[f64]) -> Vec<f64> {
+    mdp.propagate(counts)
+}

@@ -23,7 +23,9 @@ pub struct StatisticsBuilder {
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum StatisticsError {
     /// The trajectory belongs to another process.
-    #[error("expected states below {n_states} and actions below {n_actions}, got state {state} and action {action} at step {step}")]
+    #[error(
+        "expected states below {n_states} and actions below {n_actions}, got state {state} and action {action} at step {step}"
+    )]
     OutOfRange {
         /// Number of states.
         n_states: usize,
@@ -77,7 +79,10 @@ impl StatisticsBuilder {
     ///
     /// # Errors
     /// As [`StatisticsBuilder::add`]; the trajectories before the wrong one stay counted.
-    pub fn extend<'a>(&mut self, trajectories: impl IntoIterator<Item = &'a Trajectory>) -> Result<(), StatisticsError> {
+    pub fn extend<'a>(
+        &mut self,
+        trajectories: impl IntoIterator<Item = &'a Trajectory>,
+    ) -> Result<(), StatisticsError> {
         trajectories.into_iter().try_for_each(|trajectory| self.add(trajectory))
     }
 

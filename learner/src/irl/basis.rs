@@ -24,7 +24,9 @@ enum Kind {
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum BasisError {
     /// Wrong number of entries.
-    #[error("expected a feature table of {n_pairs} rows and {n_basis} columns with at least one column, got {got} entries")]
+    #[error(
+        "expected a feature table of {n_pairs} rows and {n_basis} columns with at least one column, got {got} entries"
+    )]
     Shape {
         /// Number of state-action pairs.
         n_pairs: usize,

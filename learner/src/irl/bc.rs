@@ -36,9 +36,11 @@ impl Method for Bc {
             }
         }
         trace.record(log_likelihood, 0.0)?;
-        let mut warnings = vec!["behaviour cloning learns no reward: weights, reward and values are empty or zero".to_owned()];
+        let mut warnings =
+            vec!["behaviour cloning learns no reward: weights, reward and values are empty or zero".to_owned()];
         if unvisited > 0 {
-            warnings.push(format!("{unvisited} of {n_states} states were never demonstrated: the policy is uniform there"));
+            warnings
+                .push(format!("{unvisited} of {n_states} states were never demonstrated: the policy is uniform there"));
         }
         Ok(Fit {
             weights: Vec::new(),

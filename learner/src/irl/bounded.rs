@@ -129,7 +129,9 @@ fn search(
 
 /// −H g on the free variables.
 fn two_loop(steepest: &[f64], free: &[bool], history: &[(Vec<f64>, Vec<f64>)]) -> Vec<f64> {
-    let masked = |a: &[f64], b: &[f64]| -> f64 { a.iter().zip(b).zip(free).map(|((a, b), &f)| if f { a * b } else { 0.0 }).sum() };
+    let masked = |a: &[f64], b: &[f64]| -> f64 {
+        a.iter().zip(b).zip(free).map(|((a, b), &f)| if f { a * b } else { 0.0 }).sum()
+    };
     let mut direction = steepest.to_vec();
     let usable: Vec<(&(Vec<f64>, Vec<f64>), f64)> = history
         .iter()

@@ -122,7 +122,11 @@ fn stationary(linear: &[f64], curvature: &[f64], reference: usize) -> Result<Vec
     let shown: Vec<usize> = (0..curvature.len()).filter(|&i| curvature[i] > 0.0).collect();
     if shown.len() > MAX_DEMONSTRATED {
         let (limit, got) = (MAX_DEMONSTRATED, shown.len());
-        return Err(FitError::TooLarge { what: "demonstrated basis functions (m_step simplex has no limit)", limit, got });
+        return Err(FitError::TooLarge {
+            what: "demonstrated basis functions (m_step simplex has no limit)",
+            limit,
+            got,
+        });
     }
     let hidden = curvature.len() - shown.len();
     let columns = shown.len() + usize::from(hidden > 0);

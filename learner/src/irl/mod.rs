@@ -81,7 +81,9 @@ pub enum FitError {
         message: String,
     },
     /// Model and data belong to different processes.
-    #[error("expected statistics of {n_states} states and {n_actions} actions, got {got_states} states and {got_actions} actions")]
+    #[error(
+        "expected statistics of {n_states} states and {n_actions} actions, got {got_states} states and {got_actions} actions"
+    )]
     Mismatch {
         /// States of the model.
         n_states: usize,

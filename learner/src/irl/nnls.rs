@@ -46,7 +46,10 @@ pub fn nnls(a: &DMatrix<f64>, b: &DVector<f64>) -> Nnls {
             .filter(|&(j, gradient)| gradient > GRADIENT_TOLERANCE * lengths[j] * b_length)
             // scaled, so that the choice does not depend on the columns' units; the first of equals
             .map(|(j, gradient)| (j, gradient / lengths[j]))
-            .fold(None, |best: Option<(usize, f64)>, now| if best.is_none_or(|b| now.1 > b.1) { Some(now) } else { best });
+            .fold(
+                None,
+                |best: Option<(usize, f64)>, now| if best.is_none_or(|b| now.1 > b.1) { Some(now) } else { best },
+            );
         let Some((entering, _)) = entering else { break };
         if iterations >= 10 * n + 100 {
             converged = false;

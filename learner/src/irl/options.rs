@@ -118,11 +118,9 @@ impl FitOptions {
         if self.max_iterations == 0 {
             return invalid("max_iterations", "expected at least 1 iteration, got 0".to_owned());
         }
-        for (field, value) in [
-            ("penalty_strength", self.penalty_strength),
-            ("tolerance", self.tolerance),
-            ("smoothing", self.smoothing),
-        ] {
+        for (field, value) in
+            [("penalty_strength", self.penalty_strength), ("tolerance", self.tolerance), ("smoothing", self.smoothing)]
+        {
             if !(value.is_finite() && value >= 0.0) {
                 return invalid(field, format!("expected a finite number that is not negative, got {value}"));
             }

@@ -45,7 +45,9 @@ pub enum MdpError {
         reason: String,
     },
     /// Columns and probabilities differ in length.
-    #[error("expected as many probabilities as next states, got {next_states} next states and {probabilities} probabilities")]
+    #[error(
+        "expected as many probabilities as next states, got {next_states} next states and {probabilities} probabilities"
+    )]
     Ragged {
         /// Length of the columns.
         next_states: usize,
@@ -53,7 +55,9 @@ pub enum MdpError {
         probabilities: usize,
     },
     /// A next state outside the state set, or not in rising order.
-    #[error("expected next states rising and below {n_states} in row (state {state}, action {action}), got {next_state}")]
+    #[error(
+        "expected next states rising and below {n_states} in row (state {state}, action {action}), got {next_state}"
+    )]
     NextState {
         /// Row.
         state: usize,

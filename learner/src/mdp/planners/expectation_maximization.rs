@@ -10,8 +10,8 @@
 //! - Under a finite prior a stationary policy's greedy M-step need not raise the likelihood. It is taken where it does, and
 //!   otherwise π(a|s) is multiplied by its posterior, the plain M-step, which never lowers it.
 
-use crate::mdp::linear::Resolvent;
 use crate::mdp::evaluation::average;
+use crate::mdp::linear::Resolvent;
 use crate::mdp::numeric::dot;
 use crate::mdp::plan::{Plan, PlanError};
 use crate::mdp::{Policy, TabularMdp};
@@ -21,12 +21,7 @@ const MAX_ITERATIONS: u32 = 2000;
 const MAX_MESSAGES: usize = 64 << 20;
 
 /// Without a horizon: geometric prior without end, γ < 1. With one: p(T) uniform over 1..`horizon`.
-pub(crate) fn plan(
-    mdp: &TabularMdp,
-    reward: &[f64],
-    discount: f64,
-    horizon: Option<u32>,
-) -> Result<Plan, PlanError> {
+pub(crate) fn plan(mdp: &TabularMdp, reward: &[f64], discount: f64, horizon: Option<u32>) -> Result<Plan, PlanError> {
     let low = reward.iter().copied().fold(f64::INFINITY, f64::min);
     let high = reward.iter().copied().fold(f64::NEG_INFINITY, f64::max);
     let scale = if high > low { high - low } else { 1.0 };

@@ -1,7 +1,7 @@
 //! Howard's policy iteration.
 
 use crate::mdp::linear::Resolvent;
-use crate::mdp::numeric::{max_abs, max};
+use crate::mdp::numeric::{max, max_abs};
 use crate::mdp::plan::Plan;
 use crate::mdp::{Policy, TIE_TOLERANCE, TabularMdp};
 

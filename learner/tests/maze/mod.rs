@@ -1,0 +1,103 @@
+//! The reference maze: model and demonstrations computed independently, under `tests/data`.
+#![allow(dead_code, reason = "every test file uses its own part")]
+
+use mazeway_learner::mdp::TabularMdp;
+use mazeway_learner::statistics::Statistics;
+use mazeway_learner::trajectory::{Demonstrations, Trajectory};
+use serde_json::Value;
+
+pub const DISCOUNT: f64 = 0.9;
+pub const N_STATES: usize = 57;
+pub const N_ACTIONS: usize = 4;
+
+fn read(name: &str) -> Value {
+    let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/data").join(name);
+    let text = std::fs::read_to_string(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
+    serde_json::from_str(&text).expect("reference data are JSON")
+}
+
+pub fn floats(value: &Value) -> Vec<f64> {
+    value.as_array().expect("an array").iter().map(|v| v.as_f64().expect("a number")).collect()
+}
+
+fn indices(value: &Value) -> Vec<u32> {
+    value.as_array().expect("an array").iter().map(|v| v.as_u64().expect("an index") as u32).collect()
+}
+
+pub struct Maze {
+    pub mdp: TabularMdp,
+    /// R(s,a) = R(s).
+    pub reward: Vec<f64>,
+    pub state_values: Vec<f64>,
+    pub optimal_actions: Vec<Vec<u32>>,
+}
+
+impl Maze {
+    /// 1 / (number of optimal actions) on each optimal action.
+    pub fn optimal_policy(&self) -> Vec<f64> {
+        let mut policy = vec![0.0; N_STATES * N_ACTIONS];
+        for (state, actions) in self.optimal_actions.iter().enumerate() {
+            for &action in actions {
+                policy[state * N_ACTIONS + action as usize] = 1.0 / actions.len() as f64;
+            }
+        }
+        policy
+    }
+}
+
+pub fn maze() -> Maze {
+    let model = read("maze_model.json");
+    let mut rows = vec![Vec::new(); N_STATES * N_ACTIONS];
+    for entry in model["transition"].as_array().expect("rows") {
+        let entry = floats(entry);
+        rows[entry[0] as usize * N_ACTIONS + entry[1] as usize].push((entry[2] as u32, entry[3]));
+    }
+    let (mut offsets, mut next, mut probabilities) = (vec![0], Vec::new(), Vec::new());
+    for row in rows {
+        for (state, p) in row {
+            next.push(state);
+            probabilities.push(p);
+        }
+        offsets.push(next.len());
+    }
+    let mdp = TabularMdp::new(N_STATES, N_ACTIONS, offsets, next, probabilities, None).expect("a checked model");
+    let mut reward = vec![0.0; N_STATES * N_ACTIONS];
+    for state in indices(&model["rewarded_states"]) {
+        reward[state as usize * N_ACTIONS..(state as usize + 1) * N_ACTIONS].fill(1.0);
+    }
+    Maze {
+        mdp,
+        reward,
+        state_values: floats(&model["state_values"]),
+        optimal_actions: model["optimal_actions"].as_array().expect("rows").iter().map(indices).collect(),
+    }
+}
+
+pub fn demonstrations() -> Demonstrations {
+    let data = read("maze_demonstrations.json");
+    let states = data["states"].as_array().expect("rows");
+    let actions = data["actions"].as_array().expect("rows");
+    states
+        .iter()
+        .zip(actions)
+        .map(|(s, a)| {
+            Trajectory::new(indices(s), indices(a), None, N_STATES as u32, N_ACTIONS as u32).expect("a trajectory")
+        })
+        .collect()
+}
+
+pub fn statistics(demonstrations: &Demonstrations) -> Statistics {
+    let mut builder = Statistics::builder(N_STATES, N_ACTIONS, None);
+    builder.extend(demonstrations).expect("within the maze");
+    builder.finish().expect("at least one trajectory")
+}
+
+pub fn cases() -> Vec<Value> {
+    read("maze_fits.json")["cases"].as_array().expect("cases").clone()
+}
+
+/// Share of states whose greedy action is optimal, ties split evenly.
+pub fn agreement(greedy: &[f64], optimal: &[f64]) -> f64 {
+    let agreed: f64 = greedy.iter().zip(optimal).filter(|&(_, o)| *o > 0.0).map(|(g, _)| g).sum();
+    agreed / N_STATES as f64
+}

@@ -7,12 +7,14 @@
 //! Deliberately absent: any computation of what is reported.
 
 mod format;
+pub mod html;
 pub mod json;
 pub mod pictures;
 #[cfg(test)]
 mod samples;
 mod space;
 pub mod table;
+pub mod write;
 
 use crate::irl::{FitOptions, Stopped, TraceEntry};
 use serde::{Deserialize, Serialize};

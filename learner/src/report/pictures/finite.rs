@@ -11,8 +11,8 @@ use plotters::style::Color;
 /// States and actions drawn at most.
 const MOST_STATES: usize = 60;
 const MOST_ACTIONS: usize = 24;
-/// Room for names.
-const STATE_NAMES: f64 = 120.0;
+/// Room for the names of the states at most.
+const STATE_NAMES: f64 = 176.0;
 const SET: f64 = 10.5;
 
 /// What all pictures of a process share.
@@ -22,7 +22,10 @@ struct Layout {
     all: bool,
     row: f64,
     column: f64,
+    /// Height of the actions' names.
     names: f64,
+    /// Left edge of the first column.
+    left: f64,
 }
 
 impl Layout {
@@ -38,10 +41,20 @@ impl Layout {
             actions.sort_unstable();
         }
         let all = all_states && actions.len() == report.actions();
-        let column = ((WIDTH - 2.0 * MARGIN - STATE_NAMES) / actions.len().max(1) as f64).min(80.0);
+        let longest = states.iter().map(|&s| text_width(&report.state_name(s, 60), SET)).fold(40.0, f64::max);
+        let left = MARGIN + (longest + 10.0).min(STATE_NAMES);
+        let column = ((WIDTH - MARGIN - left) / actions.len().max(1) as f64).min(80.0);
         let row = if states.len() > 20 { 15.0 } else { 22.0 };
         let longest = actions.iter().map(|&a| text_width(&report.action_name(a, 22), SET)).fold(0.0, f64::max);
-        Self { states, actions, all, row, column, names: if longest < column - 4.0 { 20.0 } else { longest + 12.0 } }
+        Self {
+            states,
+            actions,
+            all,
+            row,
+            column,
+            left,
+            names: if longest < column - 4.0 { 20.0 } else { longest + 12.0 },
+        }
     }
 
     fn height(&self) -> f64 {
@@ -66,10 +79,10 @@ impl Layout {
     /// Names of the states, `top` being the upper edge of the first row.
     fn state_names(&self, canvas: &Canvas<'_>, report: &Report, top: f64) {
         for (i, &state) in self.states.iter().enumerate() {
-            let name = fit(&report.state_name(state, 60), SET, STATE_NAMES - 8.0);
+            let name = fit(&report.state_name(state, 60), SET, self.left - MARGIN - 8.0);
             let colour = if report.visited(state) { super::colour::INK } else { MUTED };
             let y = top + (i as f64 + 0.5) * self.row;
-            canvas.text(MARGIN + STATE_NAMES - 8.0, y, &name, Type::new(SET).right().colour(colour));
+            canvas.text(self.left - 8.0, y, &name, Type::new(SET).right().colour(colour));
         }
     }
 }
@@ -114,7 +127,7 @@ fn pairs(
     let note = layout.note(report, what);
     let svg = Canvas::draw(name, size, &format!("{heading}: {note}"), |canvas| {
         title(canvas, MARGIN, 0.0, WIDTH - 2.0 * MARGIN, heading, &note);
-        let (left, top) = (MARGIN + STATE_NAMES, TITLE + layout.names);
+        let (left, top) = (layout.left, TITLE + layout.names);
         for (j, &action) in layout.actions.iter().enumerate() {
             let (x, text) = (left + (j as f64 + 0.5) * layout.column, report.action_name(action, 22));
             let set = Type::new(SET).colour(MUTED);
@@ -156,7 +169,7 @@ fn bars(report: &Report, layout: &Layout) -> Result<Picture, ReportError> {
     let svg = Canvas::draw("visits", size, &format!("Visits: {note}"), |canvas| {
         title(canvas, MARGIN, 0.0, WIDTH - 2.0 * MARGIN, "Visits", &note);
         layout.state_names(canvas, report, TITLE);
-        let left = MARGIN + STATE_NAMES;
+        let left = layout.left;
         let scale = Scale::from_zero(layout.states.iter().map(|&state| report.state_visits[state]));
         for (i, &state) in layout.states.iter().enumerate() {
             let value = report.state_visits[state];

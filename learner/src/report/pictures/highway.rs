@@ -128,9 +128,9 @@ fn heat(
     bar(canvas, MARGIN, FOOT, WIDTH - 2.0 * MARGIN, &scale, unit, unvisited);
 }
 
-/// Ground of a cell that takes up a speed level: the lighter half of the scale, so that ink reads on it.
+/// Ground of a cell that takes up a speed level: the lighter third of the scale, so that ink reads on it.
 fn speed_colour(level: usize) -> RGBColor {
-    Scale::from_zero([1.0]).at([0.02, 0.17, 0.32, 0.47][level.min(3)])
+    Scale::from_zero([1.0]).at([0.02, 0.13, 0.25, 0.37][level.min(3)])
 }
 
 /// Direction of a lane change on the page: the road runs to the right, its left lane is on top.

@@ -62,7 +62,6 @@ pub fn all(report: &Report) -> Result<Vec<Picture>, ReportError> {
 
 #[cfg(test)]
 mod tests {
-    use super::*;
     use crate::report::samples;
 
     #[test]
@@ -71,11 +70,7 @@ mod tests {
             [("maze", samples::maze()), ("highway", samples::highway()), ("plain", samples::plain(30, 3))]
         {
             let dir = std::path::Path::new("/tmp/look").join(name);
-            std::fs::create_dir_all(&dir).unwrap();
-            for picture in all(&report).unwrap() {
-                std::fs::write(dir.join(format!("{}.svg", picture.name)), &picture.svg).unwrap();
-                std::fs::write(dir.join(format!("{}.png", picture.name)), png(&picture.svg).unwrap()).unwrap();
-            }
+            crate::report::write::write(&report, &dir).unwrap();
         }
     }
 }

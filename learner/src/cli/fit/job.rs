@@ -1,0 +1,221 @@
+//! From flags to a job, checked without I/O: whatever can be refused before a server is asked is refused here.
+
+use super::args::{
+    BasisArg, FitArgs, HorizonPriorArg, MStepArg, PenaltyArg, PlannerArg, ResponsibilityArg,
+};
+use crate::{cli::CliError, irl};
+use mazeway_proto::learner::{self as pb, FitOptions};
+use std::collections::BTreeMap;
+
+/// Which recordings a fit learns from.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Source {
+    /// The user's own where there are any, else the scripted expert's.
+    Preferred,
+    /// The scripted expert's.
+    Expert,
+    /// Whatever is recorded under the style.
+    Any,
+    /// This source.
+    Named(String),
+}
+
+/// A checked job.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Job {
+    /// Environment.
+    pub env_id: String,
+    /// Options of the environment.
+    pub env_options: BTreeMap<String, serde_json::Value>,
+    /// Style; `None`: the environment's first.
+    pub style: Option<String>,
+    /// Method id.
+    pub method: &'static str,
+    /// Number of trajectories, where given.
+    pub trajectories: Option<u32>,
+    /// Steps of each, where given.
+    pub horizon: Option<u32>,
+    /// Which recordings.
+    pub source: Source,
+    /// Whether the scripted expert may demonstrate.
+    pub demonstrate: bool,
+    /// Options of the fit; horizon and basis are filled in once the environment is known.
+    pub options: FitOptions,
+    /// Basis, where given.
+    pub basis: Option<pb::Basis>,
+    /// Seed.
+    pub seed: u32,
+    /// Episodes of a roll-out.
+    pub rollouts: u32,
+}
+
+/// Default number of trajectories and steps of each.
+pub fn default_sizes(env_id: &str) -> (u32, u32) {
+    if env_id == "Highway-v0" { (200, 5) } else { (100, 50) }
+}
+
+/// Default basis.
+pub fn default_basis(env_id: &str) -> pb::Basis {
+    if env_id == "Highway-v0" { pb::Basis::StateAction } else { pb::Basis::State }
+}
+
+impl Job {
+    /// Checks the flags.
+    ///
+    /// # Errors
+    /// An unknown method, numbers out of range, malformed options: all usage errors.
+    pub fn new(args: &FitArgs) -> Result<Self, CliError> {
+        let method = irl::METHODS.iter().find(|method| method.id() == args.method).ok_or_else(|| {
+            let known: Vec<_> = irl::METHODS.iter().map(|method| method.id()).collect();
+            CliError::usage(
+                format!("unknown method '{}' for --method", args.method),
+                format!("choose one of {}", known.join(", ")),
+            )
+        })?;
+        if !(args.discount >= 0.0 && args.discount < 1.0) {
+            return Err(CliError::usage(
+                format!("expected --discount in [0, 1), got {}", args.discount),
+                "a discount close to 1, such as 0.99, looks far ahead",
+            ));
+        }
+        for (flag, value) in [
+            ("--penalty-strength", args.penalty_strength),
+            ("--smoothing", args.smoothing),
+            ("--tolerance", args.tolerance),
+        ] {
+            if !value.is_finite() || value < 0.0 {
+                return Err(CliError::usage(
+                    format!("expected {flag} to be a number of at least 0, got {value}"),
+                    "leave it out for the default: learner fit --help",
+                ));
+            }
+        }
+        Ok(Self {
+            env_id: args.env.clone(),
+            env_options: args.env_options.iter().map(|text| env_option(text)).collect::<Result<_, _>>()?,
+            style: args.style.clone(),
+            method: method.id(),
+            trajectories: args.trajectories,
+            horizon: args.horizon,
+            source: match args.source.as_deref() {
+                None => Source::Preferred,
+                Some("expert") => Source::Expert,
+                Some("any") => Source::Any,
+                Some(name) => Source::Named(name.to_owned()),
+            },
+            demonstrate: !args.no_demonstrate,
+            options: fit_options(args),
+            basis: args.basis.map(|basis| match basis {
+                BasisArg::State => pb::Basis::State,
+                BasisArg::StateAction => pb::Basis::StateAction,
+            }),
+            seed: args.seed,
+            rollouts: args.rollouts,
+        })
+    }
+}
+
+/// Parses `key=value`; a value that is not JSON is a string.
+fn env_option(text: &str) -> Result<(String, serde_json::Value), CliError> {
+    let (key, value) = text.split_once('=').filter(|(key, _)| !key.is_empty()).ok_or_else(|| {
+        CliError::usage(
+            format!("expected KEY=VALUE for --env-option, got '{text}'"),
+            "for example: --env-option density=6",
+        )
+    })?;
+    let value = serde_json::from_str(value).unwrap_or_else(|_| serde_json::Value::String(value.to_owned()));
+    Ok((key.to_owned(), value))
+}
+
+fn fit_options(args: &FitArgs) -> FitOptions {
+    FitOptions {
+        discount: Some(args.discount),
+        horizon: args.horizon,
+        horizon_prior: match args.horizon_prior {
+            HorizonPriorArg::Geometric => pb::HorizonPrior::Geometric,
+            HorizonPriorArg::Uniform => pb::HorizonPrior::Uniform,
+        }
+        .into(),
+        basis: pb::Basis::Unspecified.into(),
+        m_step: match args.m_step {
+            MStepArg::Nnls => pb::MStep::Nnls,
+            MStepArg::Simplex => pb::MStep::Simplex,
+        }
+        .into(),
+        responsibility: match args.responsibility {
+            ResponsibilityArg::Approximate => pb::Responsibility::Approximate,
+            ResponsibilityArg::Exact => pb::Responsibility::Exact,
+        }
+        .into(),
+        planner: match args.planner {
+            PlannerArg::ValueIteration => pb::Planner::ValueIteration,
+            PlannerArg::PolicyIteration => pb::Planner::PolicyIteration,
+            PlannerArg::SoftValueIteration => pb::Planner::SoftValueIteration,
+            PlannerArg::ExpectationMaximization => pb::Planner::ExpectationMaximization,
+        }
+        .into(),
+        reference_basis: Some(args.reference_basis),
+        penalty: match args.penalty {
+            PenaltyArg::L1 => pb::Penalty::L1,
+            PenaltyArg::L2 => pb::Penalty::L2,
+            PenaltyArg::None => pb::Penalty::None,
+        }
+        .into(),
+        penalty_strength: Some(args.penalty_strength),
+        tolerance: Some(args.tolerance),
+        max_iterations: Some(args.max_iterations),
+        smoothing: Some(args.smoothing),
+        seed: Some(u64::from(args.seed)),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::Parser;
+
+    #[derive(Parser)]
+    struct Cli {
+        #[command(flatten)]
+        fit: FitArgs,
+    }
+
+    fn job(flags: &[&str]) -> Result<Job, CliError> {
+        let cli = Cli::try_parse_from(std::iter::once("fit").chain(flags.iter().copied())).expect("flags parse");
+        Job::new(&cli.fit)
+    }
+
+    #[test]
+    fn defaults_are_the_documented_ones() {
+        let job = job(&[]).unwrap();
+        assert_eq!((job.env_id.as_str(), job.method), ("Highway-v0", "em-tied"));
+        assert_eq!(job.options.discount, Some(0.9));
+        assert_eq!(job.source, Source::Preferred);
+        assert!(job.demonstrate);
+        assert_eq!(default_sizes("Highway-v0"), (200, 5));
+        assert_eq!(default_sizes("Maze-v0"), (100, 50));
+    }
+
+    #[test]
+    fn wrong_values_are_usage_errors() {
+        for flags in [
+            vec!["--method", "magic"],
+            vec!["--discount", "1.5"],
+            vec!["--discount", "NaN"],
+            vec!["--penalty-strength=-1"],
+            vec!["--env-option", "density"],
+            vec!["--env-option", "=6"],
+        ] {
+            let error = job(&flags).expect_err("refused");
+            assert_eq!(error.code, 2, "{flags:?}");
+            assert!(!error.hint.is_empty(), "{flags:?}");
+        }
+    }
+
+    #[test]
+    fn environment_options_are_json_where_they_can_be() {
+        let job = job(&["--env-option", "density=6", "--env-option", "observation=kinematics"]).unwrap();
+        assert_eq!(job.env_options["density"], serde_json::json!(6));
+        assert_eq!(job.env_options["observation"], serde_json::json!("kinematics"));
+    }
+}

@@ -6,7 +6,7 @@ use crate::mdp::TabularMdp;
 #[derive(Debug, Clone, PartialEq)]
 pub struct Basis {
     n_pairs: usize,
-    n_basis: usize,
+    n_functions: usize,
     kind: Kind,
 }
 
@@ -49,13 +49,13 @@ impl Basis {
     /// Dirac on states, `n_states` functions.
     #[must_use]
     pub fn state(mdp: &TabularMdp) -> Self {
-        Self { n_pairs: mdp.n_pairs(), n_basis: mdp.n_states(), kind: Kind::State { n_actions: mdp.n_actions() } }
+        Self { n_pairs: mdp.n_pairs(), n_functions: mdp.n_states(), kind: Kind::State { n_actions: mdp.n_actions() } }
     }
 
     /// Dirac on state-action pairs, `n_states * n_actions` functions.
     #[must_use]
     pub fn state_action(mdp: &TabularMdp) -> Self {
-        Self { n_pairs: mdp.n_pairs(), n_basis: mdp.n_pairs(), kind: Kind::StateAction }
+        Self { n_pairs: mdp.n_pairs(), n_functions: mdp.n_pairs(), kind: Kind::StateAction }
     }
 
     /// A feature table of shape (`n_states * n_actions`, `n_basis`), row-major.
@@ -80,17 +80,17 @@ impl Basis {
             }
             offsets.push(columns.len());
         }
-        Ok(Self { n_pairs, n_basis, kind: Kind::Features { offsets, columns, values } })
+        Ok(Self { n_pairs, n_functions: n_basis, kind: Kind::Features { offsets, columns, values } })
     }
 
     /// Number of basis functions B.
     pub fn len(&self) -> usize {
-        self.n_basis
+        self.n_functions
     }
 
     /// Never: a basis has at least one function.
     pub fn is_empty(&self) -> bool {
-        self.n_basis == 0
+        self.n_functions == 0
     }
 
     /// Calls `visit` with each basis function that is not zero at a pair, and its value there.
@@ -117,7 +117,7 @@ impl Basis {
 
     /// Σ_{s,a} values(s,a) Φ(s,a), shape (`n_basis`,).
     pub fn project(&self, values: &[f64]) -> Vec<f64> {
-        let mut projected = vec![0.0; self.n_basis];
+        let mut projected = vec![0.0; self.n_functions];
         for (pair, &v) in values.iter().enumerate() {
             if v != 0.0 {
                 self.for_each(pair, |b, value| projected[b] += value * v);

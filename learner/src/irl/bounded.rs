@@ -40,7 +40,7 @@ pub(super) fn minimise(
         *v = v.max(settings.lower);
     }
     let (mut value, mut gradient) = value_and_gradient(&x);
-    let mut history: Vec<(Vec<f64>, Vec<f64>)> = Vec::new();
+    let mut history: Vec<Pair> = Vec::new();
     let mut values = vec![value];
     for iteration in 1..=settings.max_iterations {
         let free: Vec<bool> = x.iter().zip(&gradient).map(|(&x, &g)| x > settings.lower || g < 0.0).collect();
@@ -94,7 +94,10 @@ pub(super) fn minimise(
     Ok(Minimum { x, stopped: Stopped::MaxIterations })
 }
 
+/// x, value and gradient.
 type Point = (Vec<f64>, f64, Vec<f64>);
+/// A step and the change of the gradient along it.
+type Pair = (Vec<f64>, Vec<f64>);
 
 /// Steps back along the projected path until the value falls enough.
 #[expect(clippy::too_many_arguments, reason = "the state of the iteration; private to this file")]
@@ -128,12 +131,12 @@ fn search(
 }
 
 /// −H g on the free variables.
-fn two_loop(steepest: &[f64], free: &[bool], history: &[(Vec<f64>, Vec<f64>)]) -> Vec<f64> {
+fn two_loop(steepest: &[f64], free: &[bool], history: &[Pair]) -> Vec<f64> {
     let masked = |a: &[f64], b: &[f64]| -> f64 {
         a.iter().zip(b).zip(free).map(|((a, b), &f)| if f { a * b } else { 0.0 }).sum()
     };
     let mut direction = steepest.to_vec();
-    let usable: Vec<(&(Vec<f64>, Vec<f64>), f64)> = history
+    let usable: Vec<(&Pair, f64)> = history
         .iter()
         .map(|pair| (pair, masked(&pair.0, &pair.1)))
         .filter(|&(pair, curvature)| curvature > 1e-12 * masked(&pair.1, &pair.1).max(f64::MIN_POSITIVE))

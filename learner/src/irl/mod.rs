@@ -3,6 +3,8 @@
 //! A method takes a [`Problem`] and returns a [`Fit`]. Stopping is a value: a fit that did not converge still gives its
 //! best. Deliberately absent: where the data come from and where the fit goes.
 
+#![expect(clippy::doc_markdown, reason = "formulae in the notation of the papers are not code")]
+
 mod basis;
 mod bc;
 mod bounded;

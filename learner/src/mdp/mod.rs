@@ -4,6 +4,8 @@
 //! for taking action a in state s; Q(s,a) = R(s,a) + γ Σ P(s'|s,a) V(s'). Deliberately absent: sampling (that is the
 //! simulators' work) and any notion of where a model comes from.
 
+#![expect(clippy::doc_markdown, reason = "formulae in the notation of the papers are not code")]
+
 mod evaluation;
 mod linear;
 mod numeric;

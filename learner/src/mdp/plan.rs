@@ -77,6 +77,13 @@ pub struct PlanOptions {
     pub horizon_prior: HorizonPrior,
 }
 
+impl Default for PlanOptions {
+    /// Discount 0.9, no horizon, geometric prior.
+    fn default() -> Self {
+        Self { discount: 0.9, horizon: None, horizon_prior: HorizonPrior::Geometric }
+    }
+}
+
 /// What a planner returns.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Plan {

@@ -4,6 +4,8 @@
 use mazeway_learner::mdp::TabularMdp;
 use mazeway_learner::statistics::Statistics;
 use mazeway_learner::trajectory::{Demonstrations, Trajectory};
+use rand_core::Rng;
+use rand_pcg::Pcg64;
 use serde_json::Value;
 
 pub const DISCOUNT: f64 = 0.9;
@@ -100,4 +102,37 @@ pub fn cases() -> Vec<Value> {
 pub fn agreement(greedy: &[f64], optimal: &[f64]) -> f64 {
     let agreed: f64 = greedy.iter().zip(optimal).filter(|&(_, o)| *o > 0.0).map(|(g, _)| g).sum();
     agreed / N_STATES as f64
+}
+
+/// Episodes of the optimal policy, ties split evenly, from uniform starts; the same for a seed on every platform.
+pub fn simulate(maze: &Maze, episodes: usize, steps: usize, seed: u64) -> Demonstrations {
+    let policy = maze.optimal_policy();
+    let mut random = Pcg64::new(u128::from(seed), 0xa02_bdbf_7bb3_c0a7);
+    (0..episodes)
+        .map(|_| {
+            let mut state = draw(maze.mdp.initial_distribution(), &mut random);
+            let (mut states, mut actions) = (Vec::new(), Vec::new());
+            for _ in 0..steps {
+                let action = draw(&policy[state * N_ACTIONS..(state + 1) * N_ACTIONS], &mut random);
+                states.push(state as u32);
+                actions.push(action as u32);
+                let (next, probabilities) = maze.mdp.row(maze.mdp.pair(state, action));
+                state = next[draw(probabilities, &mut random)] as usize;
+            }
+            Trajectory::new(states, actions, Some(state as u32), N_STATES as u32, N_ACTIONS as u32)
+                .expect("a trajectory")
+        })
+        .collect()
+}
+
+/// Index drawn from a distribution.
+pub fn draw(distribution: &[f64], random: &mut Pcg64) -> usize {
+    let mut left = (random.next_u64() >> 11) as f64 / (1_u64 << 53) as f64;
+    for (index, p) in distribution.iter().enumerate() {
+        left -= p;
+        if left < 0.0 {
+            return index;
+        }
+    }
+    distribution.iter().rposition(|p| *p > 0.0).expect("a distribution")
 }

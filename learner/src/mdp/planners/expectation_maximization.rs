@@ -57,7 +57,7 @@ fn geometric(mdp: &TabularMdp, reward: &[f64], likelihood: &[f64], discount: f64
             let resolvent = Resolvent::new(mdp, policy.probabilities(), discount);
             let state_values = resolvent.solve(&average(mdp, policy.probabilities(), reward));
             let action_values = mdp.action_values(reward, discount, &state_values);
-            return Plan { policy, state_values, action_values, iterations, converged };
+            return Plan { state_values, action_values, policy, iterations, converged };
         }
     }
 }
@@ -132,7 +132,7 @@ fn uniform(mdp: &TabularMdp, likelihood: &[f64], low: f64, scale: f64, horizon: 
     // back into the reward's unit: the mean reward at the end of the mixture
     let action_values: Vec<f64> = per_state(&messages, n_actions).iter().map(|b| low + scale * b).collect();
     let state_values = average(mdp, policy.probabilities(), &action_values);
-    Plan { policy, state_values, action_values, iterations, converged }
+    Plan { state_values, action_values, policy, iterations, converged }
 }
 
 /// Expected reward after each action, averaged over the times at which its state is passed; over all times where it is never

@@ -30,6 +30,7 @@ pub use recording::{
 };
 pub use schema::FILE_NAME;
 pub use trajectories::{Cursor, TrajectorySummary};
+pub use writer::Pending;
 
 use mazeway_proto::learner as pb;
 use rusqlite::Connection;
@@ -60,7 +61,7 @@ pub struct Store(Arc<Inner>);
 struct Inner {
     path: PathBuf,
     writer: Writer,
-    pending: Semaphore,
+    pending: Arc<Semaphore>,
     readers: Mutex<Vec<Connection>>,
 }
 
@@ -69,7 +70,7 @@ impl Store {
     pub fn open(directory: &Path) -> Result<Self, StoreError> {
         let (path, connection) = schema::open(directory)?;
         let writer = Writer::start(connection, path.clone())?;
-        let pending = Semaphore::new(PENDING_BYTES / PENDING_UNIT);
+        let pending = Arc::new(Semaphore::new(PENDING_BYTES / PENDING_UNIT));
         Ok(Self(Arc::new(Inner { path, writer, pending, readers: Mutex::default() })))
     }
 
@@ -83,10 +84,17 @@ impl Store {
     /// # Errors
     /// [`StoreError::TrajectoryExists`] where an id is stored with another content.
     pub async fn record(&self, recordings: Vec<Recording>) -> Result<u32, StoreError> {
+        self.queue_recordings(recordings).await?.committed().await
+    }
+
+    /// As [`Store::record`], but comes back as soon as the trajectories have their place in the order of recording.
+    pub async fn queue_recordings(&self, recordings: Vec<Recording>) -> Result<Pending<u32>, StoreError> {
         let bytes = recordings.iter().map(Recording::packed_bytes).sum::<usize>();
         let units = bytes.div_ceil(PENDING_UNIT).clamp(1, PENDING_BYTES / PENDING_UNIT);
-        let _pending = self.0.pending.acquire_many(units as u32).await.map_err(|_| StoreError::Closed)?;
+        let pending = Arc::clone(&self.0.pending);
+        let pending = pending.acquire_many_owned(units as u32).await.map_err(|_| StoreError::Closed)?;
         let job = move |work: &mut writer::Work<'_>| {
+            let _pending = pending;
             let mut stored = 0;
             for (index, recording) in recordings.iter().enumerate() {
                 let new = trajectories::insert(work.connection, work.path, work.collections, recording, index)?;
@@ -94,7 +102,7 @@ impl Store {
             }
             Ok(stored)
         };
-        self.0.writer.submit(job).await
+        self.0.writer.queue(job).await
     }
 
     /// Deletes what the filter selects and returns how many there were.
@@ -129,7 +137,7 @@ impl Store {
     ) -> Result<T, StoreError> {
         let job =
             move |work: &mut writer::Work<'_>| job(work.connection).map_err(|e| StoreError::from_sqlite(work.path, &e));
-        self.0.writer.submit(job).await
+        self.0.writer.queue(job).await?.committed().await
     }
 
     /// Reads on after the trajectory of rank `after`, 0 for the first, at most `limit`. Blocks.

@@ -1,7 +1,7 @@
 //! Tabular models in the store: checked, named by their content, kept packed as they came.
 //!
 //! Invariants of a [`Model`]: every row (s, a) is there once, its next states rise and lie within the sizes, its
-//! probabilities are positive and sum to 1; labels and rewards have the sizes that the header says; the id is the
+//! probabilities are not negative and sum to 1; labels and rewards have the sizes that the header says; the id is the
 //! SHA-256 that `mazeway/env/v1/model.proto` lays down.
 
 use super::{
@@ -17,8 +17,8 @@ use std::path::Path;
 
 /// Version of the header's encoding: a protocol buffer message behind this byte.
 const DOCUMENT_VERSION: u8 = 1;
-/// How far the sum of a row may lie from 1.
-const ROW_SUM_TOLERANCE: f64 = 1e-6;
+/// How far a sum of probabilities may lie from 1, as for [`crate::mdp::TabularMdp`].
+const ROW_SUM_TOLERANCE: f64 = 1e-9;
 
 /// Rows of the transition function, packed as in `mazeway.env.v1.RowBlock`, all in one block.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
@@ -110,7 +110,7 @@ pub fn check_header(header: &ModelHeader) -> Result<(), FieldError> {
             let (expected, got) = (n_states * 8, start.len());
             return field("initial_distribution", format!("expected {expected} bytes or none, got {got}"));
         }
-        if let Some((state, p)) = unpack_f64(start).enumerate().find(|(_, p)| !(0.0..=1.0).contains(p)) {
+        if let Some((state, p)) = unpack_f64(start).enumerate().find(|(_, p)| !(0.0..=1.0 + ROW_SUM_TOLERANCE).contains(p)) {
             return field("initial_distribution", format!("expected probabilities, got {p} at state {state}"));
         }
         let sum = unpack_f64(start).sum::<f64>();
@@ -175,8 +175,8 @@ fn check_rows(header: &ModelHeader, rows: &Rows) -> Result<(), FieldError> {
             if before.is_some_and(|before| before >= next) {
                 return field("next_states", format!("expected rising next states, got {next} out of order {}", at()));
             }
-            if !(p > 0.0 && p <= 1.0 + ROW_SUM_TOLERANCE) {
-                return field("probabilities", format!("expected probabilities above 0, got {p} {}", at()));
+            if !(0.0..=1.0 + ROW_SUM_TOLERANCE).contains(&p) {
+                return field("probabilities", format!("expected values from 0 to 1, got {p} {}", at()));
             }
             before = Some(next);
             sum += p;

@@ -51,11 +51,12 @@ impl Writer {
         Ok(Self { jobs: Some(jobs), thread: Some(thread) })
     }
 
-    /// Runs `job` in a transaction and returns its result once that is on stable storage.
-    pub(super) async fn submit<T: Send + 'static>(
+    /// Queues `job` for a transaction, behind all that was queued before. What it gives is the job's result once that
+    /// is on stable storage.
+    pub(super) async fn queue<T: Send + 'static>(
         &self,
         job: impl FnOnce(&mut Work<'_>) -> Result<T, StoreError> + Send + 'static,
-    ) -> Result<T, StoreError> {
+    ) -> Result<Pending<T>, StoreError> {
         let (answer, result) = oneshot::channel();
         let job: Job = Box::new(move |work| {
             let outcome = work.and_then(|work| in_savepoint(work, job));
@@ -66,7 +67,18 @@ impl Writer {
         });
         let jobs = self.jobs.as_ref().ok_or(StoreError::Closed)?;
         jobs.send(job).await.map_err(|_| StoreError::Closed)?;
-        result.await.map_err(|_| StoreError::Closed)?
+        Ok(Pending(result))
+    }
+}
+
+/// A job that is queued.
+#[derive(Debug)]
+pub struct Pending<T>(oneshot::Receiver<Result<T, StoreError>>);
+
+impl<T> Pending<T> {
+    /// Waits for the commit. The job runs whether anybody waits or not.
+    pub async fn committed(self) -> Result<T, StoreError> {
+        self.0.await.map_err(|_| StoreError::Closed)?
     }
 }
 

@@ -1,0 +1,96 @@
+//! Settings of the learner service: where it keeps its data, limits and times.
+
+use std::{path::PathBuf, time::Duration};
+
+/// Everything that a learner service can be told.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Config {
+    /// Directory of the recordings, models and fits; made where it is missing.
+    pub data: PathBuf,
+    /// What it refuses.
+    pub limits: Limits,
+}
+
+impl Config {
+    /// The default limits over the data of a directory.
+    pub fn new(data: impl Into<PathBuf>) -> Self {
+        Self { data: data.into(), limits: Limits::default() }
+    }
+}
+
+/// Limits, each a flag of `learner serve`. What exceeds one is refused with RESOURCE_EXHAUSTED.
+#[derive(Debug, Clone, PartialEq, clap::Args)]
+#[command(next_help_heading = "Limits")]
+pub struct Limits {
+    /// Largest message accepted or sent, in bytes
+    #[arg(long, env = "MAZEWAY_LEARNER_MAX_MESSAGE_BYTES", default_value_t = 32 << 20, value_name = "BYTES")]
+    pub max_message_bytes: usize,
+    /// Trajectories in one request
+    #[arg(long, env = "MAZEWAY_LEARNER_MAX_TRAJECTORIES_PER_REQUEST", default_value_t = 10_000, value_name = "N")]
+    pub max_trajectories_per_request: usize,
+    /// Steps of one trajectory
+    #[arg(long, env = "MAZEWAY_LEARNER_MAX_STEPS", default_value_t = 1_000_000, value_name = "N")]
+    pub max_steps_per_trajectory: usize,
+    /// Requests of one recording stream that wait for the disk; further ones wait on the wire
+    #[arg(long, env = "MAZEWAY_LEARNER_MAX_IN_FLIGHT", default_value_t = 64, value_name = "N")]
+    pub max_requests_in_flight: usize,
+    /// State-action pairs of one model
+    #[arg(long, env = "MAZEWAY_LEARNER_MAX_MODEL_ROWS", default_value_t = 4_000_000, value_name = "N")]
+    pub max_model_rows: u64,
+    /// Transitions of one model
+    #[arg(long, env = "MAZEWAY_LEARNER_MAX_MODEL_TRANSITIONS", default_value_t = 20_000_000, value_name = "N")]
+    pub max_model_transitions: u64,
+    /// Fits that run at a time; further ones wait their turn
+    #[arg(long, env = "MAZEWAY_LEARNER_MAX_CONCURRENT_FITS", default_value_t = 2, value_name = "N")]
+    pub max_concurrent_fits: usize,
+    /// Fits that wait their turn
+    #[arg(long, env = "MAZEWAY_LEARNER_MAX_QUEUED_FITS", default_value_t = 64, value_name = "N")]
+    pub max_queued_fits: usize,
+    /// Calls and streams of one connection at a time
+    #[arg(long, env = "MAZEWAY_LEARNER_MAX_STREAMS", default_value_t = 256, value_name = "N")]
+    pub max_streams_per_connection: u32,
+    /// Time between HTTP/2 pings that find out whether a silent peer is still there
+    #[arg(long, env = "MAZEWAY_LEARNER_KEEPALIVE", default_value = "10s", value_parser = duration, value_name = "TIME")]
+    pub keepalive: Duration,
+    /// Time that running calls have to end when the service is told to stop
+    #[arg(long, env = "MAZEWAY_LEARNER_GRACE", default_value = "10s", value_parser = duration, value_name = "TIME")]
+    pub shutdown_grace: Duration,
+}
+
+impl Default for Limits {
+    /// The defaults of the flags.
+    fn default() -> Self {
+        Self {
+            max_message_bytes: 32 << 20,
+            max_trajectories_per_request: 10_000,
+            max_steps_per_trajectory: 1_000_000,
+            max_requests_in_flight: 64,
+            max_model_rows: 4_000_000,
+            max_model_transitions: 20_000_000,
+            max_concurrent_fits: 2,
+            max_queued_fits: 64,
+            max_streams_per_connection: 256,
+            keepalive: Duration::from_secs(10),
+            shutdown_grace: Duration::from_secs(10),
+        }
+    }
+}
+
+fn duration(text: &str) -> Result<Duration, String> {
+    match humantime::parse_duration(text) {
+        Ok(duration) if !duration.is_zero() => Ok(duration),
+        _ => Err("expected a time above 0 with its unit, such as 10s or 2m".into()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::{Args as _, FromArgMatches as _};
+
+    #[test]
+    fn the_flags_have_the_defaults_of_the_library() {
+        let matches = Limits::augment_args(clap::Command::new("limits")).get_matches_from(["limits"]);
+        assert_eq!(Limits::from_arg_matches(&matches).unwrap(), Limits::default());
+    }
+}

@@ -1,0 +1,76 @@
+//! The stream that records: requests go to the store in the order in which they came, answers come back in that order,
+//! each once its trajectories are on stable storage. Reading goes on while the disk works, up to a limit.
+
+use super::{blocking, from_proto, status::CallError};
+use crate::{
+    config::Limits,
+    store::{Pending, Recording, Store},
+};
+use futures_util::{Stream, StreamExt as _};
+use mazeway_proto::learner as pb;
+use std::sync::Arc;
+use tokio::sync::mpsc;
+use tokio_stream::wrappers::ReceiverStream;
+use tokio_util::sync::CancellationToken;
+use tonic::{Status, Streaming};
+
+/// Bytes of a request from which it is checked on a thread of its own.
+const LARGE_BYTES: usize = 1 << 20;
+
+/// A request that has its place in the order of recording.
+struct Queued {
+    trajectory_ids: Vec<String>,
+    stored: Pending<u32>,
+}
+
+/// Reads requests until the caller has no more, errs or goes, or the service stops.
+pub fn record(
+    store: Store,
+    limits: Arc<Limits>,
+    mut requests: Streaming<pb::RecordTrajectoriesRequest>,
+    stopping: CancellationToken,
+) -> impl Stream<Item = Result<pb::RecordTrajectoriesResponse, Status>> {
+    let (queue, queued) = mpsc::channel::<Result<Queued, CallError>>(limits.max_requests_in_flight.max(1));
+    tokio::spawn(async move {
+        loop {
+            // A place in the queue first: what is not read yet waits on the wire.
+            let Ok(place) = queue.reserve().await else { return };
+            let request = tokio::select! {
+                request = requests.message() => request,
+                () = stopping.cancelled() => return place.send(Err(CallError::ShuttingDown)),
+                () = queue.closed() => return,
+            };
+            let outcome = match request {
+                Ok(Some(request)) => enqueue(&store, &limits, request).await,
+                Ok(None) => return,
+                Err(status) => Err(status.into()),
+            };
+            let failed = outcome.is_err();
+            place.send(outcome);
+            if failed {
+                return;
+            }
+        }
+    });
+    ReceiverStream::new(queued).then(|queued| async move {
+        let Queued { trajectory_ids, stored } = queued?;
+        let stored = stored.committed().await.map_err(CallError::from)?;
+        Ok(pb::RecordTrajectoriesResponse { trajectory_ids, stored })
+    })
+}
+
+async fn enqueue(
+    store: &Store,
+    limits: &Arc<Limits>,
+    request: pb::RecordTrajectoriesRequest,
+) -> Result<Queued, CallError> {
+    let bytes = request.trajectories.iter().map(|t| t.states.len() + t.actions.len() + t.rewards.len()).sum::<usize>();
+    let recordings: Vec<Recording> = if bytes < LARGE_BYTES {
+        from_proto::recordings(request, limits)?
+    } else {
+        let limits = Arc::clone(limits);
+        blocking(move || from_proto::recordings(request, &limits)).await?
+    };
+    let trajectory_ids = recordings.iter().map(|recording| recording.id().to_string()).collect();
+    Ok(Queued { trajectory_ids, stored: store.queue_recordings(recordings).await? })
+}

@@ -1,0 +1,134 @@
+//! One enum of everything that can be wrong with a call, and one exhaustive map from it to gRPC statuses.
+
+use crate::store::{FieldError, StoreError};
+use tonic::{Code, Status};
+use tonic_types::{ErrorDetails, StatusExt as _};
+
+/// A call that is answered with a status.
+#[derive(Debug, Clone, thiserror::Error)]
+pub enum CallError {
+    /// A field that does not hold what it should.
+    #[error(transparent)]
+    Field(#[from] FieldError),
+    /// The store refused.
+    #[error(transparent)]
+    Store(#[from] StoreError),
+    /// Nothing of this name.
+    #[error("there is no {what} {id:?}")]
+    NotFound {
+        /// Field that names it.
+        field: &'static str,
+        /// What it would be.
+        what: &'static str,
+        /// The name.
+        id: String,
+    },
+    /// There is nothing, or not enough, to work on.
+    #[error("{message}")]
+    Precondition {
+        /// What kind of thing is missing, in capitals.
+        kind: &'static str,
+        /// Field of the request that asks for it.
+        field: &'static str,
+        /// What was expected and what is there.
+        message: String,
+    },
+    /// A limit of the service.
+    #[error("{field}: expected at most {limit} {what}, got {got}")]
+    Limit {
+        /// Field that exceeds it.
+        field: String,
+        /// Of what.
+        what: &'static str,
+        /// The limit.
+        limit: u64,
+        /// What came.
+        got: u64,
+    },
+    /// The caller went.
+    #[error("the caller went before the fit was done")]
+    Cancelled,
+    /// The service is going down.
+    #[error("the service is shutting down")]
+    ShuttingDown,
+    /// A status of the transport's, passed on.
+    #[error("{0}")]
+    Transport(Box<Status>),
+    /// A defect of ours.
+    #[error("internal error: {0}")]
+    Internal(String),
+}
+
+impl CallError {
+    /// A field that does not hold what it should.
+    pub fn field(field: impl Into<String>, message: impl Into<String>) -> Self {
+        FieldError::new(field, message).into()
+    }
+}
+
+impl From<Status> for CallError {
+    /// An error of reading the caller's stream. tonic calls a message above the limit OUT_OF_RANGE.
+    fn from(status: Status) -> Self {
+        if status.code() == Code::OutOfRange {
+            return Self::Transport(Box::new(Status::resource_exhausted(status.message())));
+        }
+        Self::Transport(Box::new(status))
+    }
+}
+
+impl From<CallError> for Status {
+    fn from(error: CallError) -> Self {
+        let message = error.to_string();
+        let mut details = ErrorDetails::new();
+        let code = match &error {
+            CallError::Field(error) => {
+                details.add_bad_request_violation(error.field.as_str(), error.message.as_str());
+                Code::InvalidArgument
+            }
+            CallError::NotFound { field, .. } => {
+                details.add_bad_request_violation(*field, message.as_str());
+                Code::NotFound
+            }
+            CallError::Precondition { kind, field, .. } => {
+                details.add_precondition_failure_violation(*kind, *field, message.as_str());
+                Code::FailedPrecondition
+            }
+            CallError::Limit { field, .. } => {
+                details.add_quota_failure_violation(field.as_str(), message.as_str());
+                Code::ResourceExhausted
+            }
+            CallError::Store(error) => store_code(error, &message, &mut details),
+            CallError::Cancelled => Code::Cancelled,
+            CallError::ShuttingDown => Code::Unavailable,
+            CallError::Transport(status) => return (**status).clone(),
+            CallError::Internal(_) => Code::Internal,
+        };
+        if matches!(code, Code::Internal | Code::DataLoss) {
+            tracing::error!(%message, "a call failed through no fault of its caller");
+        }
+        Self::with_error_details(code, message, details)
+    }
+}
+
+fn store_code(error: &StoreError, message: &str, details: &mut ErrorDetails) -> Code {
+    match error {
+        StoreError::TrajectoryExists { index, .. } => {
+            details.add_bad_request_violation(format!("trajectories[{index}].trajectory_id"), message);
+            Code::AlreadyExists
+        }
+        StoreError::AmbiguousFit { .. } => {
+            details.add_bad_request_violation("fit_id", message);
+            Code::InvalidArgument
+        }
+        StoreError::DiskFull { .. } => {
+            details.add_quota_failure_violation("disk", message);
+            Code::ResourceExhausted
+        }
+        StoreError::Busy { .. } | StoreError::Closed => Code::Unavailable,
+        StoreError::Corrupt { .. } => Code::DataLoss,
+        StoreError::Directory { .. }
+        | StoreError::NewerSchema { .. }
+        | StoreError::Foreign { .. }
+        | StoreError::Database { .. } => Code::Internal,
+    }
+}

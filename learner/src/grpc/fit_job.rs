@@ -1,0 +1,293 @@
+//! A fit from the request to the message that is stored: checked without I/O first, then run where it may block.
+
+use super::{from_proto, options, status::CallError};
+use crate::{
+    irl::{self, FitError, FitOptions, Method, Problem, TraceEntry},
+    mdp::TabularMdp,
+    statistics::{Statistics, StatisticsBuilder},
+    store::{FieldError, Filter, Model, Recording, Store, check_model_id, clip, pack_f64, unpack_f64, unpack_u32},
+    trajectory::Demonstrations,
+};
+use mazeway_proto::learner as pb;
+use std::{ops::ControlFlow, time::Instant};
+use uuid::Uuid;
+
+/// What a fit is asked to do.
+pub struct FitJob {
+    request: pb::FitRequest,
+    method: &'static dyn Method,
+    filter: Filter,
+    options: FitOptions,
+}
+
+/// The demonstrations of a fit, counted.
+struct Data {
+    trajectory_ids: Vec<String>,
+    statistics: Statistics,
+    demonstrations: Option<Demonstrations>,
+    env_id: String,
+    style: String,
+    model_id: String,
+}
+
+impl FitJob {
+    /// Checks a request as far as that goes without the data.
+    pub fn new(mut request: pb::FitRequest) -> Result<Self, CallError> {
+        let method = irl::method(&request.method).ok_or_else(|| {
+            let known = irl::METHODS.iter().map(|method| method.id()).collect::<Vec<_>>().join(", ");
+            CallError::field("method", format!("expected one of {known}, got {:?}", clip(&request.method)))
+        })?;
+        let filter = from_proto::filter(request.filter.clone())?;
+        check_model_id("model_id", &request.model_id)?;
+        let options = options::from_proto(request.options.as_ref())?;
+        request.options = Some(options::to_proto(&options));
+        request.filter.get_or_insert_default();
+        Ok(Self { request, method, filter, options })
+    }
+
+    /// Reads the data, fits, and says everything that is worth storing. Calls `progress` after every iteration and asks
+    /// `cancelled` between trajectories; blocks.
+    pub fn run(
+        self,
+        store: &Store,
+        mut progress: impl FnMut(&TraceEntry) -> ControlFlow<()>,
+        cancelled: impl Fn() -> bool,
+    ) -> Result<pb::Fit, CallError> {
+        let load = |model_id: &str| {
+            store.model(model_id)?.ok_or_else(|| CallError::NotFound {
+                field: "model_id",
+                what: "model",
+                id: model_id.to_owned(),
+            })
+        };
+        // A model that is asked for is looked for before anything is read.
+        let asked = if self.request.model_id.is_empty() { None } else { Some(load(&self.request.model_id)?) };
+        let data = self.gather(store, cancelled)?;
+        let model = asked.map_or_else(|| load(&data.model_id), Ok)?;
+        self.check_sizes(&model, &data)?;
+        let mdp = mdp(&model)?;
+        let problem = Problem {
+            mdp: &mdp,
+            options: &self.options,
+            statistics: &data.statistics,
+            demonstrations: data.demonstrations.as_ref(),
+        };
+        let begun = Instant::now();
+        let fit = self.method.fit(&problem, &mut progress).map_err(refused)?;
+        Ok(self.describe(&model, data, &fit, begun.elapsed().as_secs_f64()))
+    }
+
+    /// Streams the trajectories through the counts.
+    fn gather(&self, store: &Store, cancelled: impl Fn() -> bool) -> Result<Data, CallError> {
+        let mut gathering = Gathering::new(self);
+        let wanted = self.request.max_trajectories as usize;
+        let outcome = store.for_each(&self.filter, |recording| {
+            if cancelled() {
+                return ControlFlow::Break(Err(CallError::Cancelled));
+            }
+            if let Err(error) = gathering.add(&recording) {
+                return ControlFlow::Break(Err(error));
+            }
+            if gathering.trajectory_ids.len() == wanted { ControlFlow::Break(Ok(())) } else { ControlFlow::Continue(()) }
+        })?;
+        if let ControlFlow::Break(Err(error)) = outcome {
+            return Err(error);
+        }
+        gathering.finish()
+    }
+
+    fn check_sizes(&self, model: &Model, data: &Data) -> Result<(), CallError> {
+        let (n_states, n_actions) = (model.header().n_states as usize, model.header().n_actions as usize);
+        let (s, a) = (data.statistics.n_states(), data.statistics.n_actions());
+        if (n_states, n_actions) == (s, a) {
+            return Ok(());
+        }
+        let message = format!(
+            "expected a model of {s} states and {a} actions as the trajectories have, got {n_states} states and \
+             {n_actions} actions"
+        );
+        Err(CallError::field("model_id", message))
+    }
+
+    fn describe(self, model: &Model, data: Data, fit: &irl::Fit, fit_secs: f64) -> pb::Fit {
+        let counts = data.statistics.counts(None);
+        let steps = data.statistics.n_steps(None);
+        // Pairs that were not seen count nothing, whatever the policy says of them.
+        let mean = |value: &dyn Fn(usize) -> f64| {
+            let seen = counts.iter().enumerate().filter(|&(_, &n)| n > 0.0);
+            seen.map(|(pair, n)| n * value(pair)).sum::<f64>() / steps as f64
+        };
+        pb::Fit {
+            fit_id: Uuid::new_v4().to_string(),
+            created_at: None,
+            version: env!("CARGO_PKG_VERSION").into(),
+            env_id: data.env_id,
+            style: data.style,
+            model_id: model.model_id().into(),
+            n_states: model.header().n_states,
+            n_actions: model.header().n_actions,
+            trajectory_ids: data.trajectory_ids,
+            steps,
+            weights: pack_f64(&fit.weights),
+            reward: pack_f64(&fit.reward),
+            policy: pack_f64(&fit.policy),
+            greedy_policy: pack_f64(&fit.greedy_policy),
+            state_values: pack_f64(&fit.state_values),
+            state_visits: pack_f64(&data.statistics.state_visits(None)),
+            trace: fit.trace.iter().map(progress_message).collect(),
+            stopped: options::stopped(fit.stopped) as i32,
+            iterations: fit.iterations,
+            fit_secs,
+            warnings: fit.warnings.clone(),
+            log_likelihood_per_step: mean(&|pair| fit.policy[pair].ln()),
+            agreement: mean(&|pair| fit.greedy_policy[pair]),
+            states_covered: data.statistics.states_covered(None) as u32,
+            request: Some(self.request),
+        }
+    }
+}
+
+/// One iteration on the wire.
+pub fn progress_message(entry: &TraceEntry) -> pb::FitProgress {
+    pb::FitProgress {
+        iteration: entry.iteration,
+        objective: entry.objective,
+        change: entry.change,
+        elapsed_secs: entry.elapsed_secs,
+    }
+}
+
+/// Trajectories as they come in.
+struct Gathering<'a> {
+    job: &'a FitJob,
+    builder: Option<StatisticsBuilder>,
+    demonstrations: Option<Demonstrations>,
+    trajectory_ids: Vec<String>,
+    /// Of the first trajectory; a label in which another one differs is emptied.
+    first: crate::store::Collection,
+}
+
+impl<'a> Gathering<'a> {
+    fn new(job: &'a FitJob) -> Self {
+        Self {
+            job,
+            builder: None,
+            demonstrations: job.method.needs_demonstrations().then(Demonstrations::default),
+            trajectory_ids: Vec::new(),
+            first: crate::store::Collection::default(),
+        }
+    }
+
+    fn add(&mut self, recording: &Recording) -> Result<(), CallError> {
+        let collection = recording.collection();
+        if self.builder.is_none() {
+            let (n_states, n_actions) = (collection.n_states as usize, collection.n_actions as usize);
+            self.builder = Some(Statistics::builder(n_states, n_actions, self.job.options.horizon));
+            self.first = collection.clone();
+        }
+        self.check_same_process(recording)?;
+        if self.first.env_id != collection.env_id {
+            self.first.env_id.clear();
+        }
+        if self.first.style != collection.style {
+            self.first.style.clear();
+        }
+        let corrupt = |e: &dyn std::fmt::Display| CallError::Internal(format!("trajectory {}: {e}", recording.id()));
+        let trajectory = recording.trajectory().map_err(|e| corrupt(&e))?;
+        if let Some(builder) = &mut self.builder {
+            builder.add(&trajectory).map_err(|e| corrupt(&e))?;
+        }
+        if let Some(demonstrations) = &mut self.demonstrations {
+            demonstrations.push(match self.job.options.horizon {
+                Some(horizon) => trajectory.truncated(horizon as usize),
+                None => trajectory,
+            });
+        }
+        self.trajectory_ids.push(recording.id().to_string());
+        Ok(())
+    }
+
+    /// One fit, one process: the model that is asked for, or the one that all trajectories name.
+    fn check_same_process(&self, recording: &Recording) -> Result<(), CallError> {
+        let (first, this) = (&self.first, recording.collection());
+        let refuse = |kind, message| Err(CallError::Precondition { kind, field: "model_id", message });
+        if self.job.request.model_id.is_empty() {
+            if this.model_id.is_empty() {
+                return refuse(
+                    "NO_MODEL",
+                    format!("trajectory {} names no model, and none is asked for", recording.id()),
+                );
+            }
+            if this.model_id != first.model_id {
+                let message = format!(
+                    "expected trajectories of one model, got {} and {}; name one in filter.model_id",
+                    first.model_id, this.model_id
+                );
+                return refuse("SEVERAL_MODELS", message);
+            }
+        }
+        if (this.n_states, this.n_actions) != (first.n_states, first.n_actions) {
+            let message = format!(
+                "expected trajectories of one process, got {} states and {} actions beside {} states and {} actions",
+                first.n_states, first.n_actions, this.n_states, this.n_actions
+            );
+            return refuse("SEVERAL_PROCESSES", message);
+        }
+        Ok(())
+    }
+
+    fn finish(self) -> Result<Data, CallError> {
+        let (wanted, found) = (self.job.request.max_trajectories as usize, self.trajectory_ids.len());
+        let missing = |message| CallError::Precondition { kind: "TOO_FEW_TRAJECTORIES", field: "filter", message };
+        let Some(builder) = self.builder else {
+            let wanted = wanted.max(1);
+            return Err(missing(format!("expected at least {wanted} trajectories, the filter selects 0")));
+        };
+        if found < wanted {
+            return Err(missing(format!("expected at least {wanted} trajectories, the filter selects {found}")));
+        }
+        Ok(Data {
+            trajectory_ids: self.trajectory_ids,
+            statistics: builder.finish().map_err(|e| CallError::Internal(e.to_string()))?,
+            demonstrations: self.demonstrations,
+            env_id: self.first.env_id,
+            style: self.first.style,
+            model_id: self.first.model_id,
+        })
+    }
+}
+
+/// The process that a stored model describes.
+fn mdp(model: &Model) -> Result<TabularMdp, CallError> {
+    let (header, rows) = (model.header(), model.rows());
+    let mut row_offsets = Vec::with_capacity(rows.row_lengths.len() / 4 + 1);
+    row_offsets.push(0);
+    let mut end = 0;
+    row_offsets.extend(unpack_u32(&rows.row_lengths).map(|length| {
+        end += length as usize;
+        end
+    }));
+    let start = &header.initial_distribution;
+    TabularMdp::new(
+        header.n_states as usize,
+        header.n_actions as usize,
+        row_offsets,
+        unpack_u32(&rows.next_states).collect(),
+        unpack_f64(&rows.probabilities).collect(),
+        if start.is_empty() { None } else { Some(unpack_f64(start).collect()) },
+    )
+    .map_err(|e| CallError::Internal(format!("model {}: {e}", model.model_id())))
+}
+
+/// Why a method refused.
+fn refused(error: FitError) -> CallError {
+    match error {
+        FitError::Cancelled => CallError::Cancelled,
+        FitError::InvalidOption { field, message } => FieldError::new(format!("options.{field}"), message).into(),
+        FitError::TooLarge { what, limit, got } => {
+            CallError::Limit { field: "model_id".into(), what, limit: limit as u64, got: got as u64 }
+        }
+        FitError::Plan(error) => CallError::field("options.planner", error.to_string()),
+        FitError::Mismatch { .. } | FitError::NeedsDemonstrations { .. } => CallError::Internal(error.to_string()),
+    }
+}

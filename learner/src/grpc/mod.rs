@@ -1,0 +1,25 @@
+//! The gRPC face of the learner: decoding, calling, encoding.
+//!
+//! Invariants: no call blocks an async thread, none holds memory that grows with the data, and every failure is a status
+//! that names the field to blame.
+
+mod fit;
+mod fit_job;
+mod from_proto;
+mod models;
+mod options;
+mod record;
+mod serve;
+mod service;
+mod status;
+mod to_proto;
+
+pub use serve::{ServeError, serve};
+pub use status::CallError;
+
+/// Runs work that takes a while off the async threads.
+async fn blocking<T: Send + 'static>(
+    work: impl FnOnce() -> Result<T, CallError> + Send + 'static,
+) -> Result<T, CallError> {
+    tokio::task::spawn_blocking(work).await.map_err(|error| CallError::Internal(error.to_string()))?
+}

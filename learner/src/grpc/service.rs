@@ -1,0 +1,207 @@
+//! The calls of `LearnerService`: decode, call, encode.
+
+use super::{
+    blocking,
+    fit::{FitQueue, Response as FitEvent},
+    fit_job::FitJob,
+    from_proto,
+    models::ModelBuilder,
+    record,
+    status::CallError,
+    to_proto,
+};
+use crate::{config::Limits, store::Store};
+use futures_util::Stream;
+use mazeway_proto::learner::{self as pb, learner_service_server::LearnerService};
+use std::{pin::Pin, sync::Arc};
+use tokio::sync::{Semaphore, mpsc};
+use tokio_stream::wrappers::ReceiverStream;
+use tokio_util::sync::CancellationToken;
+use tonic::{Request, Response, Status, Streaming};
+
+/// Trajectories or fits on a page that does not say.
+const PAGE_SIZE: u32 = 100;
+/// Trajectories on a page at most.
+const MAX_TRAJECTORY_PAGE: u32 = 10_000;
+/// Fits on a page at most.
+const MAX_FIT_PAGE: u32 = 1_000;
+/// Pages of an export that wait for the reader.
+const EXPORT_QUEUE: usize = 2;
+/// Models that are taken in at a time; further ones wait.
+const CONCURRENT_MODELS: usize = 2;
+
+type BoxStream<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
+
+/// The service over a store.
+pub struct LearnerGrpc {
+    store: Store,
+    limits: Arc<Limits>,
+    fits: FitQueue,
+    models: Semaphore,
+    stopping: CancellationToken,
+}
+
+impl LearnerGrpc {
+    /// `stopping` ends recording streams and keeps further fits from beginning; `aborting` ends running fits.
+    pub fn new(store: Store, limits: Limits, stopping: CancellationToken, aborting: CancellationToken) -> Self {
+        let fits = FitQueue::new(&limits, stopping.clone(), aborting);
+        Self { store, limits: Arc::new(limits), fits, models: Semaphore::new(CONCURRENT_MODELS), stopping }
+    }
+
+    /// Reads the store off the async threads.
+    async fn read<T: Send + 'static>(
+        &self,
+        read: impl FnOnce(&Store) -> Result<T, CallError> + Send + 'static,
+    ) -> Result<T, CallError> {
+        let store = self.store.clone();
+        blocking(move || read(&store)).await
+    }
+}
+
+#[tonic::async_trait]
+impl LearnerService for LearnerGrpc {
+    type RecordTrajectoriesStream = BoxStream<pb::RecordTrajectoriesResponse>;
+    type ExportTrajectoriesStream = ReceiverStream<Result<pb::ExportTrajectoriesResponse, Status>>;
+    type FitStream = ReceiverStream<FitEvent>;
+
+    async fn record_trajectories(
+        &self,
+        request: Request<Streaming<pb::RecordTrajectoriesRequest>>,
+    ) -> Result<Response<Self::RecordTrajectoriesStream>, Status> {
+        let (store, limits) = (self.store.clone(), Arc::clone(&self.limits));
+        let stream = record::record(store, limits, request.into_inner(), self.stopping.clone());
+        Ok(Response::new(Box::pin(stream)))
+    }
+
+    async fn put_model(
+        &self,
+        request: Request<Streaming<pb::PutModelRequest>>,
+    ) -> Result<Response<pb::PutModelResponse>, Status> {
+        let _permit = self.models.acquire().await.map_err(|_| CallError::ShuttingDown)?;
+        let mut parts = request.into_inner();
+        let mut builder = ModelBuilder::default();
+        while let Some(request) = parts.message().await.map_err(CallError::from)? {
+            builder.add(request.part, &self.limits)?;
+        }
+        let model = blocking(move || builder.finish()).await?;
+        let model_id = model.model_id().to_owned();
+        let stored = self.store.put_model(model).await.map_err(CallError::from)?;
+        Ok(Response::new(pb::PutModelResponse { model_id, already_stored: !stored }))
+    }
+
+    async fn list_models(
+        &self,
+        request: Request<pb::ListModelsRequest>,
+    ) -> Result<Response<pb::ListModelsResponse>, Status> {
+        let env_id = request.into_inner().env_id;
+        let models = self.read(move |store| Ok(store.models(&env_id)?)).await?;
+        let models = models.into_iter().map(to_proto::model_summary).collect();
+        Ok(Response::new(pb::ListModelsResponse { models }))
+    }
+
+    async fn list_trajectories(
+        &self,
+        request: Request<pb::ListTrajectoriesRequest>,
+    ) -> Result<Response<pb::ListTrajectoriesResponse>, Status> {
+        let request = request.into_inner();
+        let limit =
+            from_proto::page_size(request.page_size, PAGE_SIZE, MAX_TRAJECTORY_PAGE).map_err(CallError::from)?;
+        let message = request.filter.unwrap_or_default();
+        let scope = from_proto::page_scope("trajectories", &message);
+        let after = from_proto::page_start(&request.page_token, scope).map_err(CallError::from)?;
+        let filter = from_proto::filter(Some(message)).map_err(CallError::from)?;
+        let (mut summaries, total) = self
+            .read(move |store| {
+                // One more than asked for tells whether there is a next page.
+                Ok((store.summaries(&filter, after.unwrap_or(0), limit + 1)?, store.count(&filter)?))
+            })
+            .await?;
+        let more = summaries.len() > limit as usize;
+        summaries.truncate(limit as usize);
+        let last = summaries.last().filter(|_| more);
+        let next_page_token = last.map(|last| from_proto::page_token(last.seq, scope)).unwrap_or_default();
+        let trajectories = summaries.into_iter().map(to_proto::trajectory_summary).collect();
+        Ok(Response::new(pb::ListTrajectoriesResponse { trajectories, next_page_token, total }))
+    }
+
+    async fn delete_trajectories(
+        &self,
+        request: Request<pb::DeleteTrajectoriesRequest>,
+    ) -> Result<Response<pb::DeleteTrajectoriesResponse>, Status> {
+        let filter = from_proto::filter(request.into_inner().filter).map_err(CallError::from)?;
+        if filter.is_empty() {
+            let message = "expected at least one condition, got none: it would delete every trajectory";
+            return Err(CallError::field("filter", message).into());
+        }
+        let deleted = self.store.delete_trajectories(filter).await.map_err(CallError::from)?;
+        Ok(Response::new(pb::DeleteTrajectoriesResponse { deleted }))
+    }
+
+    async fn export_trajectories(
+        &self,
+        request: Request<pb::ExportTrajectoriesRequest>,
+    ) -> Result<Response<Self::ExportTrajectoriesStream>, Status> {
+        let filter = from_proto::filter(request.into_inner().filter).map_err(CallError::from)?;
+        let mut cursor = self.read(move |store| Ok(store.cursor(&filter)?)).await?;
+        let (pages, stream) = mpsc::channel(EXPORT_QUEUE);
+        let store = self.store.clone();
+        tokio::spawn(async move {
+            // A place for a page first: a reader that is slow keeps neither a thread nor a page.
+            while let Ok(place) = pages.reserve().await {
+                let reader = store.clone();
+                let page = blocking(move || Ok((reader.next_page(&mut cursor)?, cursor))).await;
+                match page {
+                    Ok((page, _)) if page.is_empty() => return,
+                    Ok((page, rest)) => {
+                        cursor = rest;
+                        let trajectories = page.into_iter().map(to_proto::trajectory).collect();
+                        place.send(Ok(pb::ExportTrajectoriesResponse { trajectories }));
+                    }
+                    Err(error) => return place.send(Err(error.into())),
+                }
+            }
+        });
+        Ok(Response::new(ReceiverStream::new(stream)))
+    }
+
+    async fn fit(&self, request: Request<pb::FitRequest>) -> Result<Response<Self::FitStream>, Status> {
+        let job = FitJob::new(request.into_inner())?;
+        let stream = self.fits.submit(job, self.store.clone())?;
+        Ok(Response::new(ReceiverStream::new(stream)))
+    }
+
+    async fn get_fit(&self, request: Request<pb::GetFitRequest>) -> Result<Response<pb::GetFitResponse>, Status> {
+        let id = from_proto::fit_prefix(&request.into_inner().fit_id).map_err(CallError::from)?;
+        let fit = self
+            .read(move |store| store.fit(&id)?.ok_or(CallError::NotFound { field: "fit_id", what: "fit", id }))
+            .await?;
+        Ok(Response::new(pb::GetFitResponse { fit: Some(fit) }))
+    }
+
+    async fn list_fits(&self, request: Request<pb::ListFitsRequest>) -> Result<Response<pb::ListFitsResponse>, Status> {
+        let pb::ListFitsRequest { env_id, style, page_size, page_token } = request.into_inner();
+        let limit = from_proto::page_size(page_size, PAGE_SIZE, MAX_FIT_PAGE).map_err(CallError::from)?;
+        let list = pb::ListFitsRequest { env_id, style, ..Default::default() };
+        let scope = from_proto::page_scope("fits", &list);
+        let before = from_proto::page_start(&page_token, scope).map_err(CallError::from)?.unwrap_or(i64::MAX);
+        let mut fits =
+            self.read(move |store| Ok(store.fits(&list.env_id, &list.style, before, limit + 1)?)).await?;
+        let more = fits.len() > limit as usize;
+        fits.truncate(limit as usize);
+        let last = fits.last().filter(|_| more);
+        let next_page_token = last.map(|last| from_proto::page_token(last.seq, scope)).unwrap_or_default();
+        let fits = fits.into_iter().map(to_proto::fit_summary).collect();
+        Ok(Response::new(pb::ListFitsResponse { fits, next_page_token }))
+    }
+
+    async fn delete_fit(
+        &self,
+        request: Request<pb::DeleteFitRequest>,
+    ) -> Result<Response<pb::DeleteFitResponse>, Status> {
+        let id = from_proto::fit_id(&request.into_inner().fit_id).map_err(CallError::from)?;
+        if self.store.delete_fit(id.clone()).await.map_err(CallError::from)? {
+            return Ok(Response::new(pb::DeleteFitResponse {}));
+        }
+        Err(CallError::NotFound { field: "fit_id", what: "fit", id }.into())
+    }
+}

@@ -3,13 +3,21 @@
 //! Learning flows one way: trajectory → store → statistics → fit → policy → report. The core ([`mdp`], [`trajectory`],
 //! [`statistics`], [`irl`], [`eval`]) knows no storage and no transport and compiles without the feature `service`.
 
+#[cfg(feature = "service")]
+pub mod config;
 pub mod eval;
+#[cfg(feature = "service")]
+mod grpc;
 pub mod irl;
 pub mod mdp;
 #[cfg(feature = "service")]
 pub mod report;
 pub mod statistics;
+#[cfg(feature = "service")]
+pub mod store;
 pub mod trajectory;
 
 #[cfg(feature = "service")]
-pub mod store;
+pub use config::Config;
+#[cfg(feature = "service")]
+pub use grpc::{CallError, ServeError, serve};

@@ -88,7 +88,11 @@ impl FitJob {
             if let Err(error) = gathering.add(&recording) {
                 return ControlFlow::Break(Err(error));
             }
-            if gathering.trajectory_ids.len() == wanted { ControlFlow::Break(Ok(())) } else { ControlFlow::Continue(()) }
+            if gathering.trajectory_ids.len() == wanted {
+                ControlFlow::Break(Ok(()))
+            } else {
+                ControlFlow::Continue(())
+            }
         })?;
         if let ControlFlow::Break(Err(error)) = outcome {
             return Err(error);

@@ -59,8 +59,7 @@ fn recording(message: pb::Trajectory) -> Result<Recording, FieldError> {
 fn uuid(field: &str, text: &str) -> Result<Uuid, FieldError> {
     let parsed = if text.len() == 36 { Uuid::try_parse(text).ok() } else { None };
     parsed.ok_or_else(|| {
-        let message =
-            format!("expected a UUID such as \"67e55044-10b1-426f-9247-bb680e5fe0c8\", got {:?}", clip(text));
+        let message = format!("expected a UUID such as \"67e55044-10b1-426f-9247-bb680e5fe0c8\", got {:?}", clip(text));
         FieldError::new(field, message)
     })
 }

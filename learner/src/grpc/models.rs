@@ -22,7 +22,9 @@ impl ModelBuilder {
     pub fn add(&mut self, part: Option<ModelPart>, limits: &Limits) -> Result<(), CallError> {
         match (part.and_then(|part| part.part), &self.header) {
             (None, _) => Err(CallError::field("part", "expected a header or rows, got neither")),
-            (Some(Part::Header(_)), Some(_)) => Err(CallError::field("part.header", "expected one header, got another")),
+            (Some(Part::Header(_)), Some(_)) => {
+                Err(CallError::field("part.header", "expected one header, got another"))
+            }
             (Some(Part::Header(header)), None) => self.add_header(header, limits),
             (Some(Part::Rows(_)), None) => Err(CallError::field("part.rows", "expected the header first, got rows")),
             (Some(Part::Rows(rows)), Some(_)) => self.add_rows(&rows, limits),

@@ -38,7 +38,11 @@ pub enum ServeError {
 ///
 /// # Errors
 /// The store does not open; the transport fails.
-pub async fn serve(config: Config, listener: TcpListener, shutdown: impl Future<Output = ()>) -> Result<(), ServeError> {
+pub async fn serve(
+    config: Config,
+    listener: TcpListener,
+    shutdown: impl Future<Output = ()>,
+) -> Result<(), ServeError> {
     let data = config.data.clone();
     let store = spawn_blocking(move || Store::open(&data)).await.unwrap_or(Err(StoreError::Closed))?;
     let outcome = serve_store(config, store.clone(), listener, shutdown).await;

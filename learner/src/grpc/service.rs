@@ -184,8 +184,7 @@ impl LearnerService for LearnerGrpc {
         let list = pb::ListFitsRequest { env_id, style, ..Default::default() };
         let scope = from_proto::page_scope("fits", &list);
         let before = from_proto::page_start(&page_token, scope).map_err(CallError::from)?.unwrap_or(i64::MAX);
-        let mut fits =
-            self.read(move |store| Ok(store.fits(&list.env_id, &list.style, before, limit + 1)?)).await?;
+        let mut fits = self.read(move |store| Ok(store.fits(&list.env_id, &list.style, before, limit + 1)?)).await?;
         let more = fits.len() > limit as usize;
         fits.truncate(limit as usize);
         let last = fits.last().filter(|_| more);

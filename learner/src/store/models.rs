@@ -110,7 +110,9 @@ pub fn check_header(header: &ModelHeader) -> Result<(), FieldError> {
             let (expected, got) = (n_states * 8, start.len());
             return field("initial_distribution", format!("expected {expected} bytes or none, got {got}"));
         }
-        if let Some((state, p)) = unpack_f64(start).enumerate().find(|(_, p)| !(0.0..=1.0 + ROW_SUM_TOLERANCE).contains(p)) {
+        if let Some((state, p)) =
+            unpack_f64(start).enumerate().find(|(_, p)| !(0.0..=1.0 + ROW_SUM_TOLERANCE).contains(p))
+        {
             return field("initial_distribution", format!("expected probabilities, got {p} at state {state}"));
         }
         let sum = unpack_f64(start).sum::<f64>();

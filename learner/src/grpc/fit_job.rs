@@ -133,6 +133,7 @@ impl FitJob {
             trajectory_ids: data.trajectory_ids,
             steps,
             weights: pack_f64(&fit.weights),
+            standard_errors: fit.standard_errors.as_deref().map(pack_f64).unwrap_or_default(),
             reward: pack_f64(&fit.reward),
             policy: pack_f64(&fit.policy),
             greedy_policy: pack_f64(&fit.greedy_policy),

@@ -1,1 +1,80 @@
-//! placeholder
+//! What Mazeway's end-to-end tests share: real servers on free ports of the loopback interface, shut down on drop.
+
+use mazeway_server::Config;
+use std::{net::SocketAddr, thread::JoinHandle, time::Duration};
+use tokio::sync::oneshot;
+
+/// A real environment server on a thread and a runtime of its own, so that tests with and without a runtime use it alike.
+#[derive(Debug)]
+pub struct EnvServer {
+    address: SocketAddr,
+    stop: Option<oneshot::Sender<()>>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl EnvServer {
+    /// Starts a server with default limits.
+    pub fn start() -> Self {
+        Self::with(Config { shutdown_grace: Duration::from_millis(200), ..Config::default() })
+    }
+
+    /// Starts a server.
+    ///
+    /// # Panics
+    /// No port can be bound.
+    pub fn with(config: Config) -> Self {
+        Self::at("127.0.0.1:0".parse().expect("an address"), config)
+    }
+
+    /// Starts a server on an address.
+    ///
+    /// # Panics
+    /// The port cannot be bound.
+    pub fn at(address: SocketAddr, config: Config) -> Self {
+        let (stop, stopped) = oneshot::channel();
+        let (bound, is_bound) = std::sync::mpsc::channel();
+        let thread = std::thread::spawn(move || {
+            let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build();
+            runtime.expect("a runtime").block_on(async move {
+                let listener = tokio::net::TcpListener::bind(address).await.expect("a port");
+                bound.send(listener.local_addr().expect("an address")).expect("the test waits");
+                let shutdown = async {
+                    let _ = stopped.await;
+                };
+                mazeway_server::serve(config, listener, shutdown).await.expect("a server that ends well");
+            });
+        });
+        let address = is_bound.recv().expect("a server that starts");
+        Self { address, stop: Some(stop), thread: Some(thread) }
+    }
+
+    /// Where it listens.
+    pub fn socket(&self) -> SocketAddr {
+        self.address
+    }
+
+    /// Where it listens, for clients.
+    pub fn address(&self) -> String {
+        self.address.to_string()
+    }
+
+    /// Stops it and waits until it is down.
+    pub fn stop(mut self) {
+        self.shut_down();
+    }
+
+    fn shut_down(&mut self) {
+        drop(self.stop.take());
+        if let Some(thread) = self.thread.take() {
+            let outcome = thread.join();
+            // A second panic while a test fails would hide the first.
+            assert!(outcome.is_ok() || std::thread::panicking(), "the server panicked");
+        }
+    }
+}
+
+impl Drop for EnvServer {
+    fn drop(&mut self) {
+        self.shut_down();
+    }
+}

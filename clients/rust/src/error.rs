@@ -83,7 +83,8 @@ impl From<Status> for ClientError {
     fn from(status: Status) -> Self {
         let details = status.get_error_details();
         let bad_request = details.bad_request().and_then(|d| d.field_violations.first()).map(|v| v.field.clone());
-        let precondition = || details.precondition_failure().and_then(|d| d.violations.first()).map(|v| v.subject.clone());
+        let precondition =
+            || details.precondition_failure().and_then(|d| d.violations.first()).map(|v| v.subject.clone());
         let quota = || details.quota_failure().and_then(|d| d.violations.first()).map(|v| v.subject.clone());
         let field = bad_request.or_else(precondition).or_else(quota).filter(|field| !field.is_empty());
         Self::Status { code: status.code(), field, message: status.message().to_owned() }

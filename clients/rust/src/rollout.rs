@@ -1,0 +1,251 @@
+//! Roll-outs: closed loops that the server runs, and the episodes that come of them.
+
+use crate::{
+    ClientError,
+    packed::{Packed, pack},
+    spec::{Options, options_to_wire},
+};
+use mazeway_proto::env as pb;
+use tonic::Streaming;
+
+/// Who acts.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Controller {
+    /// A scripted driver of the environment, or `"random"`.
+    Driver(String),
+    /// π(a|s) over the tabular states, shape `(n_states, n_actions)`; rows sum to 1 within 1e-6.
+    Policy(Vec<f64>),
+}
+
+impl Controller {
+    /// A scripted driver by name.
+    pub fn driver(name: impl Into<String>) -> Self {
+        Self::Driver(name.into())
+    }
+}
+
+/// What to roll out.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Rollout {
+    /// Environment.
+    pub env_id: String,
+    /// Its options.
+    pub options: Options,
+    /// Who acts.
+    pub controller: Controller,
+    /// Episode i is seeded with seed + i.
+    pub seed: u64,
+    /// How many episodes; at least 1.
+    pub episodes: u32,
+    /// Steps recorded of each; at least 1.
+    pub steps: u32,
+    /// Steps driven before the recording begins.
+    pub burn_in_steps: u32,
+    /// Leave out the arrays of every step.
+    pub totals_only: bool,
+}
+
+impl Rollout {
+    /// `episodes` of `steps` each under default options, seed 0, without burn-in.
+    pub fn new(env_id: impl Into<String>, controller: Controller, episodes: u32, steps: u32) -> Self {
+        Self {
+            env_id: env_id.into(),
+            options: Options::new(),
+            controller,
+            seed: 0,
+            episodes,
+            steps,
+            burn_in_steps: 0,
+            totals_only: false,
+        }
+    }
+
+    pub(crate) fn into_wire(self) -> pb::RolloutRequest {
+        use pb::rollout_request::Controller as Wire;
+        pb::RolloutRequest {
+            options: options_to_wire(&self.options),
+            env_id: self.env_id,
+            controller: Some(match self.controller {
+                Controller::Driver(name) => Wire::Driver(name),
+                Controller::Policy(values) => Wire::Policy(pb::TabularPolicy { probabilities: pack(values) }),
+            }),
+            seed: self.seed,
+            episodes: self.episodes,
+            steps: self.steps,
+            burn_in_steps: self.burn_in_steps,
+            totals_only: self.totals_only,
+        }
+    }
+}
+
+/// Consecutive episodes, episode after episode in flat arrays.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Episodes {
+    /// Rank of the first in its roll-out.
+    pub first_episode: u32,
+    /// Steps of each, shape `(episodes,)`.
+    pub lengths: Vec<u32>,
+    /// Tabular state before each step, shape `(sum of lengths,)`; empty where totals alone were asked for.
+    pub states: Vec<u32>,
+    /// Action of each step, likewise.
+    pub actions: Vec<u32>,
+    /// Reward of each step, likewise.
+    pub rewards: Vec<f64>,
+    /// Tabular state after the last step of each, shape `(episodes,)`.
+    pub final_states: Vec<u32>,
+    /// The episode came to an end of its own, shape `(episodes,)`.
+    pub terminated: Vec<bool>,
+    /// Sum of each episode's rewards, shape `(episodes,)`.
+    pub returns: Vec<f64>,
+    /// Sums of the summed info columns by name, each of shape `(episodes,)`.
+    pub totals: Vec<(String, Vec<f64>)>,
+}
+
+/// One episode of [`Episodes`].
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Episode<'a> {
+    /// Rank in its roll-out: it was seeded with the roll-out's seed + rank.
+    pub rank: u32,
+    /// Steps.
+    pub length: u32,
+    /// Tabular state before each step, shape `(length,)`; empty where totals alone were asked for.
+    pub states: &'a [u32],
+    /// Action of each step, likewise.
+    pub actions: &'a [u32],
+    /// Reward of each step, likewise.
+    pub rewards: &'a [f64],
+    /// Tabular state after the last step.
+    pub final_state: u32,
+    /// The episode came to an end of its own.
+    pub terminated: bool,
+    /// Sum of the rewards.
+    pub total_reward: f64,
+}
+
+impl Episodes {
+    /// Number of episodes.
+    pub fn len(&self) -> usize {
+        self.lengths.len()
+    }
+
+    /// True where there is none.
+    pub fn is_empty(&self) -> bool {
+        self.lengths.is_empty()
+    }
+
+    /// Steps of all episodes.
+    pub fn total_steps(&self) -> u64 {
+        self.lengths.iter().map(|&length| u64::from(length)).sum()
+    }
+
+    /// Sums of one summed info column, shape `(episodes,)`.
+    pub fn total(&self, name: &str) -> Option<&[f64]> {
+        self.totals.iter().find(|(known, _)| known == name).map(|(_, values)| values.as_slice())
+    }
+
+    /// The episodes in order.
+    pub fn iter(&self) -> impl Iterator<Item = Episode<'_>> {
+        let mut start = 0;
+        (0..self.len()).map(move |i| {
+            let end = if self.states.is_empty() { start } else { start + self.lengths[i] as usize };
+            let steps = start..end;
+            start = end;
+            Episode {
+                rank: self.first_episode + i as u32,
+                length: self.lengths[i],
+                states: &self.states[steps.clone()],
+                actions: &self.actions[steps.clone()],
+                rewards: &self.rewards[steps],
+                final_state: self.final_states[i],
+                terminated: self.terminated[i],
+                total_reward: self.returns[i],
+            }
+        })
+    }
+
+    /// Appends the episodes that follow.
+    fn append(&mut self, next: Self) {
+        self.lengths.extend(next.lengths);
+        self.states.extend(next.states);
+        self.actions.extend(next.actions);
+        self.rewards.extend(next.rewards);
+        self.final_states.extend(next.final_states);
+        self.terminated.extend(next.terminated);
+        self.returns.extend(next.returns);
+        for ((_, values), (_, more)) in self.totals.iter_mut().zip(next.totals) {
+            values.extend(more);
+        }
+    }
+
+    fn from_wire(wire: pb::RolloutResponse, totals_only: bool) -> Result<Self, ClientError> {
+        let episodes = wire.lengths.len() / 4;
+        let lengths: Vec<u32> = Packed::of_len(wire.lengths, episodes, "lengths")?.to_vec();
+        let steps = if totals_only { 0 } else { lengths.iter().map(|&length| length as usize).sum() };
+        let totals = wire.totals.into_iter().map(|totals| {
+            let values = Packed::<f64>::of_len(totals.values, episodes, &totals.name)?.to_vec();
+            Ok((totals.name, values))
+        });
+        Ok(Self {
+            first_episode: wire.first_episode,
+            states: Packed::of_len(wire.states, steps, "states")?.to_vec(),
+            actions: Packed::of_len(wire.actions, steps, "actions")?.to_vec(),
+            rewards: Packed::of_len(wire.rewards, steps, "rewards")?.to_vec(),
+            final_states: Packed::of_len(wire.final_states, episodes, "final states")?.to_vec(),
+            terminated: Packed::<u8>::of_len(wire.terminated, episodes, "flags")?
+                .iter()
+                .map(|flag| flag != 0)
+                .collect(),
+            returns: Packed::of_len(wire.returns, episodes, "returns")?.to_vec(),
+            totals: totals.collect::<Result<_, ClientError>>()?,
+            lengths,
+        })
+    }
+}
+
+/// Episodes as they come. Dropping it stops the roll-out on the server.
+#[derive(Debug)]
+pub struct EpisodeStream {
+    answers: Streaming<pb::RolloutResponse>,
+    asked: u32,
+    next_episode: u32,
+    totals_only: bool,
+}
+
+impl EpisodeStream {
+    pub(crate) fn new(answers: Streaming<pb::RolloutResponse>, asked: u32, totals_only: bool) -> Self {
+        Self { answers, asked, next_episode: 0, totals_only }
+    }
+
+    /// The next few episodes; `None` once all have come.
+    ///
+    /// # Errors
+    /// The server failed or broke off.
+    pub async fn next(&mut self) -> Result<Option<Episodes>, ClientError> {
+        let Some(answer) = self.answers.message().await? else {
+            return if self.next_episode == self.asked {
+                Ok(None)
+            } else {
+                Err(ClientError::protocol(format!("expected {} episodes, got {}", self.asked, self.next_episode)))
+            };
+        };
+        let episodes = Episodes::from_wire(answer, self.totals_only)?;
+        if episodes.first_episode != self.next_episode {
+            let message = format!("expected episode {}, got {}", self.next_episode, episodes.first_episode);
+            return Err(ClientError::protocol(message));
+        }
+        self.next_episode += episodes.len() as u32;
+        Ok(Some(episodes))
+    }
+
+    /// All that are still to come, together.
+    ///
+    /// # Errors
+    /// The server failed or broke off.
+    pub async fn collect(mut self) -> Result<Episodes, ClientError> {
+        let mut all = self.next().await?.unwrap_or_default();
+        while let Some(more) = self.next().await? {
+            all.append(more);
+        }
+        Ok(all)
+    }
+}

@@ -4,6 +4,7 @@
 //! Deliberately absent: time limits, autoreset and batching, which the batch above adds alike for every simulator.
 
 mod drivers;
+pub mod highway;
 pub mod maze;
 pub mod model;
 mod options;
@@ -223,6 +224,6 @@ pub struct Configured<S> {
 /// Every environment with its default options, in alphabetical order of `env_id`.
 pub fn catalogue() -> Vec<EnvSpec> {
     let none = serde_json::Map::new();
-    let specs = [maze::configure(&none).map(|c| c.spec)];
+    let specs = [highway::configure(&none).map(|c| c.spec), maze::configure(&none).map(|c| c.spec)];
     specs.into_iter().map(|spec| Arc::unwrap_or_clone(spec.expect("defaults are valid options"))).collect()
 }

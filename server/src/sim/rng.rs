@@ -74,10 +74,16 @@ mod tests {
             let mut rng = stream(seed, purpose);
             [rng.next_u64(), rng.next_u64(), rng.next_u64()]
         };
-        assert_eq!(words(0, Purpose::Dynamics), [0xb4d8697cc9ab923e, 0x877d14a879510cd3, 0x3d00c481bc6ab879]);
-        assert_eq!(words(0, Purpose::Controller), [0xeb2970a1dd476f1, 0x5a7ec009a7eb94ad, 0xc793fc2094e5b40f]);
-        assert_eq!(words(1, Purpose::Dynamics), [0x1b29018b22a0a22d, 0x8e28f3ff8f6ff984, 0x666b9957ebb57a]);
-        assert_eq!(words(u64::MAX, Purpose::Model), [0x95bef411115fdc44, 0x8e4484881206d855, 0xc14203843ea60784]);
+        assert_eq!(words(0, Purpose::Dynamics), [0xb4d8_697c_c9ab_923e, 0x877d_14a8_7951_0cd3, 0x3d00_c481_bc6a_b879]);
+        assert_eq!(
+            words(0, Purpose::Controller),
+            [0x0eb2_970a_1dd4_76f1, 0x5a7e_c009_a7eb_94ad, 0xc793_fc20_94e5_b40f]
+        );
+        assert_eq!(words(1, Purpose::Dynamics), [0x1b29_018b_22a0_a22d, 0x8e28_f3ff_8f6f_f984, 0x0066_6b99_57eb_b57a]);
+        assert_eq!(
+            words(u64::MAX, Purpose::Model),
+            [0x95be_f411_115f_dc44, 0x8e44_8488_1206_d855, 0xc142_0384_3ea6_0784]
+        );
     }
 
     #[test]

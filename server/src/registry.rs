@@ -6,7 +6,7 @@
 use crate::{
     batch::{Batch, BatchOptions, SimBatch},
     rollout::{EpisodeChunk, RolloutPlan, roll_out},
-    sim::{Configured, EnvSpec, OptionError, Simulator, TabularModel, maze},
+    sim::{Configured, EnvSpec, OptionError, Simulator, TabularModel, highway, maze},
 };
 use serde_json::{Map, Value};
 use std::{
@@ -110,6 +110,7 @@ impl Registry {
     /// All environments of this crate.
     pub fn new() -> Self {
         let mut registry = Self { entries: Vec::new(), models: ModelCache::default() };
+        registry.register(highway::ENV_ID, highway::configure, Configured::<highway::Highway>::model);
         registry.register(maze::ENV_ID, maze::configure, Configured::<maze::Maze>::model);
         registry
     }

@@ -1,4 +1,5 @@
-//! The Rust client of Mazeway: environments ([`Env`], [`VectorEnv`]), tabular models and roll-outs of an environment server.
+//! The Rust client of Mazeway: environments ([`Env`], [`VectorEnv`]), tabular models and roll-outs of an
+//! environment server; recordings ([`Recorder`]), models and fits of a learner ([`Learner`]).
 //!
 //! Packed arrays of an answer are viewed where they lie ([`packed::Packed`]). Deliberately absent: simulators and learning.
 //!
@@ -22,8 +23,10 @@ mod connection;
 mod env;
 mod error;
 pub mod info;
+pub mod learner;
 pub mod model;
 pub mod packed;
+pub mod recorder;
 pub mod rollout;
 mod session;
 pub mod spec;
@@ -33,7 +36,9 @@ pub use connection::{Connection, channel, list_environments, model, rollout};
 pub use env::{Env, Step};
 pub use error::ClientError;
 pub use info::{Infos, Observation, Observations};
+pub use learner::Learner;
 pub use model::{Grid, Model, ModelCollector, ModelError, ModelLimits};
+pub use recorder::{Demonstration, Receipt, Recorder};
 pub use rollout::{Controller, Episode, EpisodeStream, Episodes, Rollout};
 pub use session::{Autoreset, Image, SessionOptions};
 pub use spec::{EnvSpec, Options};

@@ -1,0 +1,237 @@
+//! A learner service: models, recordings and fits, in the messages of `mazeway.learner.v1`.
+
+use crate::{ClientError, Model, Recorder, connection::channel};
+use mazeway_proto::{
+    env::ModelPart,
+    learner::{self as pb, fit_response::Event, learner_service_client::LearnerServiceClient},
+};
+use tonic::{Streaming, transport::Channel};
+
+/// Largest message taken in: a fit in a large model carries several arrays over all its state-action pairs.
+const MAX_MESSAGE_BYTES: usize = 512 << 20;
+/// Summaries of trajectories asked for at a time.
+const TRAJECTORY_PAGE: u32 = 10_000;
+/// Summaries of fits asked for at a time.
+const FIT_PAGE: u32 = 1_000;
+
+/// A connection to a learner. Cloning shares it.
+#[derive(Debug, Clone)]
+pub struct Learner {
+    channel: Channel,
+    service: LearnerServiceClient<Channel>,
+}
+
+impl Learner {
+    /// Connects to a learner at `address`, such as `127.0.0.1:50052`.
+    ///
+    /// # Errors
+    /// An address that is none; nobody answers.
+    pub async fn connect(address: &str) -> Result<Self, ClientError> {
+        Ok(Self::from_channel(channel(address).await?))
+    }
+
+    /// Uses a channel that is there already.
+    pub fn from_channel(channel: Channel) -> Self {
+        let service = LearnerServiceClient::new(channel.clone()).max_decoding_message_size(MAX_MESSAGE_BYTES);
+        Self { channel, service }
+    }
+
+    /// Begins to record over the same connection.
+    pub fn recorder(&self) -> Recorder {
+        Recorder::from_channel(self.channel.clone())
+    }
+
+    /// Stores a model; returns its id and whether it was stored already.
+    ///
+    /// # Errors
+    /// A model that the learner refuses.
+    pub async fn put_model(&self, model: &Model) -> Result<pb::PutModelResponse, ClientError> {
+        self.put_model_parts(model.parts().collect()).await
+    }
+
+    /// Stores a model that is there in parts: a header, then blocks of rows.
+    ///
+    /// # Errors
+    /// A model that the learner refuses.
+    pub async fn put_model_parts(&self, parts: Vec<ModelPart>) -> Result<pb::PutModelResponse, ClientError> {
+        let requests = parts.into_iter().map(|part| pb::PutModelRequest { part: Some(part) });
+        Ok(self.service.clone().put_model(tokio_stream::iter(requests)).await?.into_inner())
+    }
+
+    /// Models in the order of their ids; an empty `env_id` means any.
+    ///
+    /// # Errors
+    /// The learner fails.
+    pub async fn list_models(&self, env_id: &str) -> Result<Vec<pb::ModelSummary>, ClientError> {
+        let request = pb::ListModelsRequest { env_id: env_id.into() };
+        Ok(self.service.clone().list_models(request).await?.into_inner().models)
+    }
+
+    /// How many trajectories a filter selects.
+    ///
+    /// # Errors
+    /// A malformed filter.
+    pub async fn count_trajectories(&self, filter: &pb::TrajectoryFilter) -> Result<u64, ClientError> {
+        Ok(self.list_trajectories_page(filter, 1, "").await?.total)
+    }
+
+    /// Trajectories without their arrays, in the order in which they were recorded.
+    ///
+    /// # Errors
+    /// A malformed filter.
+    pub async fn list_trajectories(
+        &self,
+        filter: &pb::TrajectoryFilter,
+    ) -> Result<Vec<pb::TrajectorySummary>, ClientError> {
+        let (mut all, mut token) = (Vec::new(), String::new());
+        loop {
+            let page = self.list_trajectories_page(filter, TRAJECTORY_PAGE, &token).await?;
+            all.extend(page.trajectories);
+            if page.next_page_token.is_empty() {
+                return Ok(all);
+            }
+            token = page.next_page_token;
+        }
+    }
+
+    /// One page of them; `token` is empty for the first, then the `next_page_token` of the page before.
+    ///
+    /// # Errors
+    /// A malformed filter, size or token.
+    pub async fn list_trajectories_page(
+        &self,
+        filter: &pb::TrajectoryFilter,
+        page_size: u32,
+        token: &str,
+    ) -> Result<pb::ListTrajectoriesResponse, ClientError> {
+        let request =
+            pb::ListTrajectoriesRequest { filter: Some(filter.clone()), page_size, page_token: token.to_owned() };
+        Ok(self.service.clone().list_trajectories(request).await?.into_inner())
+    }
+
+    /// Deletes what a filter selects and returns how many there were.
+    ///
+    /// # Errors
+    /// A malformed filter, or one without a condition.
+    pub async fn delete_trajectories(&self, filter: &pb::TrajectoryFilter) -> Result<u64, ClientError> {
+        let request = pb::DeleteTrajectoriesRequest { filter: Some(filter.clone()) };
+        Ok(self.service.clone().delete_trajectories(request).await?.into_inner().deleted)
+    }
+
+    /// Whole trajectories in the order in which they were recorded, as they come.
+    ///
+    /// # Errors
+    /// A malformed filter.
+    pub async fn export_trajectories(&self, filter: &pb::TrajectoryFilter) -> Result<TrajectoryStream, ClientError> {
+        let request = pb::ExportTrajectoriesRequest { filter: Some(filter.clone()) };
+        Ok(TrajectoryStream(self.service.clone().export_trajectories(request).await?.into_inner()))
+    }
+
+    /// Fits and returns the stored fit; calls `progress` now and then, at most about ten times a second. Dropping the
+    /// future cancels the fit.
+    ///
+    /// # Errors
+    /// Nothing to fit on, an unknown model, wrong options.
+    pub async fn fit(
+        &self,
+        request: pb::FitRequest,
+        mut progress: impl FnMut(&pb::FitProgress),
+    ) -> Result<pb::Fit, ClientError> {
+        let mut stream = self.fit_stream(request).await?;
+        loop {
+            match stream.next().await? {
+                Some(Event::Progress(entry)) => progress(&entry),
+                Some(Event::Fit(fit)) => return Ok(fit),
+                None => return Err(ClientError::protocol("the stream of a fit ended without a fit")),
+            }
+        }
+    }
+
+    /// Fits; progress and result as they come. Dropping the stream cancels the fit.
+    ///
+    /// # Errors
+    /// Wrong options; all else comes on the stream.
+    pub async fn fit_stream(&self, request: pb::FitRequest) -> Result<FitStream, ClientError> {
+        Ok(FitStream(self.service.clone().fit(request).await?.into_inner()))
+    }
+
+    /// A stored fit, by its id or eight or more characters of its beginning.
+    ///
+    /// # Errors
+    /// No such fit, or several.
+    pub async fn get_fit(&self, fit_id: &str) -> Result<pb::Fit, ClientError> {
+        let answer = self.service.clone().get_fit(pb::GetFitRequest { fit_id: fit_id.into() }).await?.into_inner();
+        answer.fit.ok_or_else(|| ClientError::protocol("expected a fit, got an empty answer"))
+    }
+
+    /// Fits without their arrays, newest first; an empty `env_id` or `style` means any.
+    ///
+    /// # Errors
+    /// The learner fails.
+    pub async fn list_fits(&self, env_id: &str, style: &str) -> Result<Vec<pb::FitSummary>, ClientError> {
+        let mut request = pb::ListFitsRequest {
+            env_id: env_id.into(),
+            style: style.into(),
+            page_size: FIT_PAGE,
+            page_token: String::new(),
+        };
+        let mut all = Vec::new();
+        loop {
+            let page = self.service.clone().list_fits(request.clone()).await?.into_inner();
+            all.extend(page.fits);
+            if page.next_page_token.is_empty() {
+                return Ok(all);
+            }
+            request.page_token = page.next_page_token;
+        }
+    }
+
+    /// Deletes a fit by its whole id.
+    ///
+    /// # Errors
+    /// No such fit.
+    pub async fn delete_fit(&self, fit_id: &str) -> Result<(), ClientError> {
+        self.service.clone().delete_fit(pb::DeleteFitRequest { fit_id: fit_id.into() }).await?;
+        Ok(())
+    }
+}
+
+/// Trajectories as they come.
+#[derive(Debug)]
+pub struct TrajectoryStream(Streaming<pb::ExportTrajectoriesResponse>);
+
+impl TrajectoryStream {
+    /// The next ones, at least one; `None` after the last.
+    ///
+    /// # Errors
+    /// The learner fails, or the connection.
+    pub async fn next(&mut self) -> Result<Option<Vec<pb::Trajectory>>, ClientError> {
+        loop {
+            match self.0.message().await? {
+                Some(page) if page.trajectories.is_empty() => {}
+                page => return Ok(page.map(|page| page.trajectories)),
+            }
+        }
+    }
+}
+
+/// A fit as it goes on.
+#[derive(Debug)]
+pub struct FitStream(Streaming<pb::FitResponse>);
+
+impl FitStream {
+    /// The next progress, or the fit, which is last; `None` after it.
+    ///
+    /// # Errors
+    /// Nothing to fit on, an unknown model, wrong options, a learner that fails.
+    pub async fn next(&mut self) -> Result<Option<Event>, ClientError> {
+        loop {
+            match self.0.message().await? {
+                Some(pb::FitResponse { event: Some(event) }) => return Ok(Some(event)),
+                // An event of a newer release.
+                Some(_) => {}
+                None => return Ok(None),
+            }
+        }
+    }
+}

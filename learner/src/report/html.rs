@@ -4,7 +4,7 @@
 //! the template, text in pictures by whoever drew them.
 
 use super::format::{MISSING, alike, clip, count, decimals, duration, interval_parts, options, percent, stopped};
-use super::pictures::{self, Part, Picture};
+use super::pictures::{self, Picture};
 use super::space::{LANES, SPEEDS_MPS, TRAFFIC};
 use super::table::{highway_choice, summary_rows};
 use super::{DriverMetrics, Interval, Report, ReportError};
@@ -38,10 +38,14 @@ pub(crate) fn render_with(report: &Report, pictures: &[Picture]) -> Result<Strin
     let page = environment.get_template("report.html")?.render(context! {
         heading => heading(report),
         lead => lead(report),
+        driving => driving(report),
         tiles => tiles(report),
         warnings => report.warnings.iter().map(|warning| clip(warning, 2000)).collect::<Vec<_>>(),
         drivers => drivers(report),
         groups => groups(report, pictures),
+        frame => frame(report),
+        detail => if report.is_highway() { figures(pictures, &["policy_table", "reward_table"]) } else { Vec::new() },
+        trace => figures(pictures, &["trace"]),
         states => states(report),
         results => facts(results),
         options => facts(options(report)),
@@ -50,7 +54,7 @@ pub(crate) fn render_with(report: &Report, pictures: &[Picture]) -> Result<Strin
         model_id => clip(&report.model_id, 100),
         files => names.join(", "),
     })?;
-    Ok(page)
+    Ok(page + "\n")
 }
 
 fn heading(report: &Report) -> String {
@@ -101,18 +105,19 @@ fn lead(report: &Report) -> Vec<Value> {
         parts.push(plain(format!(" and in {} of steps it was not", percent(held_out))));
     }
     parts.push(plain(".".into()));
-    if let Some(drivers) = &report.drivers {
-        let tell = |metrics: &DriverMetrics| {
-            let (speed, _) = interval_parts(&metrics.speed_mps, 1);
-            let (collisions, _) = interval_parts(&metrics.collisions, 3);
-            format!("{speed} m/s with {collisions} collisions a step")
-        };
-        let expert =
-            drivers.expert.as_ref().map_or_else(String::new, |expert| format!("; the expert at {}", tell(expert)));
-        let random = tell(&drivers.random);
-        parts.push(plain(format!(" It drives at {}{expert}; a random driver at {random}.", tell(&drivers.learned))));
-    }
     parts
+}
+
+/// How the learned driver drives, in a sentence.
+fn driving(report: &Report) -> Option<String> {
+    let drivers = report.drivers.as_ref()?;
+    let tell = |metrics: &DriverMetrics| {
+        let (speed, _) = interval_parts(&metrics.speed_mps, 1);
+        let (collisions, _) = interval_parts(&metrics.collisions, 3);
+        format!("{speed} m/s with {collisions} collisions a step")
+    };
+    let expert = drivers.expert.as_ref().map_or_else(String::new, |expert| format!("; the expert at {}", tell(expert)));
+    Some(format!("It drives at {}{expert}; a random driver at {}.", tell(&drivers.learned), tell(&drivers.random)))
 }
 
 fn tiles(report: &Report) -> Vec<Value> {
@@ -188,10 +193,7 @@ fn drivers(report: &Report) -> Option<Value> {
 
 /// Figures in groups, each with a heading.
 fn groups(report: &Report, pictures: &[Picture]) -> Vec<Value> {
-    let figure = |picture: &Picture| context! { picture => Value::from_safe_string(inline(&picture.svg)), caption => picture.caption.clone() };
-    let named = |names: &[&str]| -> Vec<Value> {
-        names.iter().filter_map(|name| pictures.iter().find(|picture| picture.name == *name)).map(figure).collect()
-    };
+    let named = |names: &[&str]| figures(pictures, names);
     let group = |id: &str, title: &str, note: &str, figures: Vec<Value>| {
         (!figures.is_empty()).then(|| context! { id => id, title => title, note => note, figures => figures })
     };
@@ -201,30 +203,42 @@ fn groups(report: &Report, pictures: &[Picture]) -> Vec<Value> {
         groups.extend(group("does", "What it does", "Learned beside optimal.", named(&["policy", "optimal_policy"])));
         groups.extend(group("seen", "What was seen, and what it is worth", "", named(&["visits", "values"])));
     } else {
-        groups.extend(group("learned", "What was learned", "", named(&["policy", "reward"])));
+        let pair = if report.is_highway() || report.grid.is_some() {
+            ["policy", "reward"]
+        } else {
+            ["policy_table", "reward_table"]
+        };
+        groups.extend(group("learned", "What was learned", "", named(&pair)));
         groups.extend(group("seen", "What was seen, and what it is worth", "", named(&["visits", "values"])));
     }
-    groups.extend(group("detail", "Every action", "", named(&["policy_table", "reward_table"])));
-    let mut fit: Vec<Value> = pictures.iter().filter(|picture| picture.part == Part::Fit).map(figure).collect();
-    if let Some(frame) = &report.frame_png {
-        let source = format!("data:image/png;base64,{}", base64::engine::general_purpose::STANDARD.encode(frame));
-        let alt = format!("A frame of {}, driven by the learned policy", heading(report));
-        let tag = environment_image(&source, &alt);
-        fit.push(context! { picture => tag, caption => "A frame of the environment as the learned policy drives it; the host is highlighted." });
-    }
-    groups.extend(group(
-        "run",
-        if report.frame_png.is_some() { "How it converged, and the road" } else { "How it converged" },
-        "",
-        fit,
-    ));
     groups
 }
 
+/// Pictures by name, as figures.
+fn figures(pictures: &[Picture], names: &[&str]) -> Vec<Value> {
+    let figure = |picture: &Picture| {
+        context! { picture => Value::from_safe_string(inline(&picture.svg)), caption => picture.caption.clone() }
+    };
+    names.iter().filter_map(|name| pictures.iter().find(|picture| picture.name == *name)).map(figure).collect()
+}
+
+/// The frame, as a figure.
+fn frame(report: &Report) -> Option<Value> {
+    let frame = report.frame_png.as_ref()?;
+    let alt = format!("A frame of {}, driven by the learned policy", heading(report));
+    let caption = "A frame of the environment as the learned policy acts in it; what it controls is highlighted.";
+    Some(context! { picture => image(frame, &alt), caption => caption })
+}
+
 /// An image element with its attributes escaped.
-fn environment_image(source: &str, alt: &str) -> Value {
+fn image(png: &[u8], alt: &str) -> Value {
+    let source = format!("data:image/png;base64,{}", base64::engine::general_purpose::STANDARD.encode(png));
+    // Width and height stand at a fixed place of every PNG. A frame as wide as a road takes the width of the page.
+    let side = |at: usize| png.get(at..at + 4).map(|b| u32::from_be_bytes([b[0], b[1], b[2], b[3]]));
+    let wide = side(16).zip(side(20)).is_some_and(|(width, height)| u64::from(width) > 2 * u64::from(height));
+    let class = if wide { "wide" } else { "square" };
     let alt = alt.replace('&', "&amp;").replace('"', "&quot;").replace('<', "&lt;").replace('>', "&gt;");
-    Value::from_safe_string(format!("<img src=\"{source}\" alt=\"{alt}\">"))
+    Value::from_safe_string(format!("<img class=\"{class}\" src=\"{source}\" alt=\"{alt}\">"))
 }
 
 /// A picture for the inside of a page: without the namespace, which HTML knows, and without the title that would pop up.
@@ -287,5 +301,6 @@ fn states(report: &Report) -> Value {
         "{which}The greedy action of the learned policy, its reward, the state’s value and its visits by the \
          demonstrations. States in italics were not visited."
     );
-    context! { note => note, columns => columns, count => states.len(), folded => states.len() >= FOLDED_FROM, rows => rows }
+    context! { note => note, columns => columns, count => states.len(), folded => states.len() >= FOLDED_FROM,
+    fixed => report.is_highway(), rows => rows }
 }

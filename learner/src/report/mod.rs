@@ -14,6 +14,8 @@ pub mod pictures;
 mod samples;
 mod space;
 pub mod table;
+#[cfg(test)]
+mod tests;
 pub mod write;
 
 use crate::irl::{FitOptions, Stopped, TraceEntry};

@@ -181,7 +181,8 @@ pub(crate) fn highway() -> Report {
             }
         }
     }
-    let interval = |mean: f64, half: f64| Interval { mean, low: mean - half, high: mean + half };
+    let round = |x: f64| (x * 1e4).round() / 1e4;
+    let interval = |mean: f64, half: f64| Interval { mean, low: round(mean - half), high: round(mean + half) };
     let metrics = |speed: f64, collisions: f64, left: f64, right: f64| DriverMetrics {
         speed_mps: interval(speed, 0.11),
         collisions: interval(collisions, 0.0008 + 0.1 * collisions),

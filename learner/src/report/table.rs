@@ -178,7 +178,8 @@ fn summary(report: &Report, terminal: Terminal) -> String {
         clip(&report.env_id, 40),
         if report.style.is_empty() { String::new() } else { format!(", {}", clip(&report.style, 40)) },
     );
-    let mut text = format!("{}  {}", terminal.heading("Fit"), terminal.dim(&what));
+    let mut text =
+        format!("{}  {}", terminal.heading("Fit"), terminal.dim(&clip(&what, terminal.width.saturating_sub(5))));
     for (name, value) in rows {
         text += &format!("\n  {} {value}", terminal.dim(&format!("{name:width$}")));
     }
@@ -260,7 +261,7 @@ fn highway(report: &Report, terminal: Terminal) -> String {
         }
     }
     right_align(&mut table, if wide { vec![1, 3, 4, 5, 7, 8, 9, 11, 12, 13] } else { vec![1, 4, 5, 6] });
-    let note = "action: lane change and speed in m/s; grey or 0 visits: not seen in the demonstrations";
+    let note = "action: lane change and speed in m/s; no visits: not seen by the learner";
     format!("{}\n{}\n{}", terminal.heading("Learned policy and reward"), terminal.dim(note), table.trim_fmt())
 }
 
@@ -352,24 +353,4 @@ fn listing(report: &Report, terminal: Terminal) -> String {
         format!("  the {} visited most of {}", states.len(), count(f64::from(report.n_states)))
     };
     format!("{}{}\n{}", terminal.heading("Learned policy and reward"), terminal.dim(&note), table.trim_fmt())
-}
-
-#[cfg(test)]
-mod tests {
-    use super::super::samples;
-    use super::*;
-
-    fn plain(report: &Report, width: usize) -> String {
-        render(report, Terminal { width, colour: false }).expect("a whole report")
-    }
-
-    #[test]
-    fn look() {
-        for width in [80, 132] {
-            println!("{}", plain(&samples::highway(), width));
-        }
-        println!("{}", plain(&samples::maze(), 80));
-        println!("{}", plain(&samples::plain(100, 3), 80));
-        println!("{}", render(&samples::maze(), Terminal { width: 80, colour: true }).unwrap());
-    }
 }

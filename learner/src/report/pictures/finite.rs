@@ -110,7 +110,20 @@ pub(super) fn pictures(report: &Report, visits: bool) -> Result<Vec<Picture>, Re
         )?,
     ];
     if visits {
-        pictures.push(bars(report, &layout)?);
+        pictures.push(bars(
+            report,
+            &layout,
+            ("visits", Part::Seen, "Visits", "steps of the demonstrations in each state"),
+            &report.state_visits,
+            "How often the demonstrations visit each state: all that the learner knows of the expert.",
+        )?);
+        pictures.push(bars(
+            report,
+            &layout,
+            ("values", Part::Learned, "State values", "expected discounted sum of the learned reward"),
+            &report.state_values,
+            "How good it is to be in each state under the learned reward.",
+        )?);
     }
     Ok(pictures)
 }
@@ -162,31 +175,36 @@ fn pairs(
     Ok(Picture { name, part: Part::Learned, title: heading, caption: caption.to_owned(), svg })
 }
 
-/// Visits of each state.
-fn bars(report: &Report, layout: &Layout) -> Result<Picture, ReportError> {
+/// A number of each state as a bar; bars start at zero.
+fn bars(
+    report: &Report,
+    layout: &Layout,
+    (name, part, heading, what): (&'static str, Part, &'static str, &str),
+    values: &[f64],
+    caption: &str,
+) -> Result<Picture, ReportError> {
     let size = (WIDTH, TITLE + layout.height() + MARGIN);
-    let note = layout.note(report, "steps of the demonstrations in each state");
-    let svg = Canvas::draw("visits", size, &format!("Visits: {note}"), |canvas| {
-        title(canvas, MARGIN, 0.0, WIDTH - 2.0 * MARGIN, "Visits", &note);
+    let note = layout.note(report, what);
+    let svg = Canvas::draw(name, size, &format!("{heading}: {note}"), |canvas| {
+        title(canvas, MARGIN, 0.0, WIDTH - 2.0 * MARGIN, heading, &note);
         layout.state_names(canvas, report, TITLE);
-        let left = layout.left;
-        let scale = Scale::from_zero(layout.states.iter().map(|&state| report.state_visits[state]));
+        let shown = || layout.states.iter().map(|&state| values[state]).filter(|x| x.is_finite());
+        let (low, high) = shown().fold((0.0f64, 0.0f64), |(low, high), x| (low.min(x), high.max(x)));
+        let span = if high > low { high - low } else { 1.0 };
+        let write = alike(shown());
+        let write = |value: f64| if part == Part::Seen { count(value) } else { write(value) };
+        let longest = shown().map(|x| text_width(&write(x), SET)).fold(0.0, f64::max);
+        let room = WIDTH - MARGIN - layout.left - longest - 8.0;
+        let zero = layout.left - room * low / span;
         for (i, &state) in layout.states.iter().enumerate() {
-            let value = report.state_visits[state];
-            let share = if value.is_finite() { (value / scale.high).clamp(0.0, 1.0) } else { 0.0 };
-            let length = share * (WIDTH - MARGIN - left - 52.0);
             let y = TITLE + i as f64 * layout.row;
-            let bar = [
-                (left, y + 2.0),
-                (left + length, y + 2.0),
-                (left + length, y + layout.row - 2.0),
-                (left, y + layout.row - 2.0),
-            ];
-            canvas.polygon(&bar, ACCENT.mix(1.0));
-            canvas.text(left + length + 6.0, y + layout.row / 2.0, &count(value), Type::new(SET).colour(MUTED));
+            let value = values[state];
+            let end = zero + if value.is_finite() { room * value / span } else { 0.0 };
+            let (top, foot) = (y + 2.0, y + layout.row - 2.0);
+            canvas.polygon(&[(zero, top), (end, top), (end, foot), (zero, foot)], ACCENT.mix(1.0));
+            canvas.text(end.max(zero) + 6.0, y + layout.row / 2.0, &write(value), Type::new(SET).colour(MUTED));
         }
-        canvas.path(&[(left, TITLE), (left, TITLE + layout.height())], MUTED, 0.8);
+        canvas.path(&[(zero, TITLE), (zero, TITLE + layout.height())], MUTED, 0.8);
     })?;
-    let caption = "How often the demonstrations visit each state: all that the learner knows of the expert.".to_owned();
-    Ok(Picture { name: "visits", part: Part::Seen, title: "Visits", caption, svg })
+    Ok(Picture { name, part, title: heading, caption: caption.to_owned(), svg })
 }

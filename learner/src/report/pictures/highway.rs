@@ -63,6 +63,18 @@ pub(super) fn pictures(report: &Report) -> Result<Vec<Picture>, ReportError> {
                 heat(canvas, report, ("Visits", &note, "visits"), (visits, scale, count));
             })?,
         },
+        Picture {
+            name: "values",
+            part: Part::Learned,
+            title: "State values",
+            caption: "How good it is to be in each state: the expected discounted sum of the learned reward.".into(),
+            svg: Canvas::draw("values", SIZE, "Value of each of the 36 states under the learned reward", |canvas| {
+                let values = &report.state_values;
+                let scale = Scale::over(values.iter().copied());
+                let note = "expected discounted sum of the learned reward";
+                heat(canvas, report, ("State values", note, "value"), (values, scale, alike(values.iter().copied())));
+            })?,
+        },
     ])
 }
 

@@ -59,18 +59,3 @@ pub fn all(report: &Report) -> Result<Vec<Picture>, ReportError> {
     pictures.extend(trace::picture(report)?);
     Ok(pictures)
 }
-
-#[cfg(test)]
-mod tests {
-    use crate::report::samples;
-
-    #[test]
-    fn look() {
-        for (name, report) in
-            [("maze", samples::maze()), ("highway", samples::highway()), ("plain", samples::plain(30, 3))]
-        {
-            let dir = std::path::Path::new("/tmp/look").join(name);
-            crate::report::write::write(&report, &dir).unwrap();
-        }
-    }
-}

@@ -16,7 +16,7 @@ pub(super) const BAR: f64 = 46.0;
 /// A title and what is shown, at the top of a panel.
 pub(super) fn title(canvas: &Canvas<'_>, x: f64, y: f64, width: f64, title: &str, note: &str) {
     canvas.text(x, y + 22.0, &fit(title, 15.5, width), Type::new(15.0).bold());
-    canvas.text(x, y + 42.0, &fit(note, 11.5, width), Type::new(11.5).colour(MUTED));
+    canvas.text(x, y + 42.0, &fit(note, 12.0, width), Type::new(12.0).colour(MUTED));
 }
 
 /// A colour bar with its ends and its middle, at (x, y); `hatch` adds the key of what was not visited.
@@ -26,14 +26,14 @@ pub(super) fn bar(canvas: &Canvas<'_>, x: f64, y: f64, width: f64, scale: &Scale
     let steps = 64;
     for i in 0..steps {
         let left = length * f64::from(i) / f64::from(steps);
-        let right = (left + length / f64::from(steps) + 0.3).min(length);
-        canvas.rect(x + left, y + 8.0, right - left, 9.0, scale.at(f64::from(i) / f64::from(steps - 1)));
+        // Each step reaches to the end and is painted over by the next: no seam shows at any size.
+        canvas.rect(x + left, y + 8.0, length - left, 9.0, scale.at(f64::from(i) / f64::from(steps - 1)));
     }
     canvas.outline(x, y + 8.0, length, 9.0, RULE, 0.7);
     let write = alike([scale.low, scale.high]);
-    let set = Type::new(10.5).colour(MUTED);
+    let set = Type::new(11.0).colour(MUTED);
     canvas.text(x, y + 27.0, &write(scale.low), set);
-    canvas.text(x + length / 2.0, y + 27.0, &fit(name, 10.5, length - 70.0), set.colour(INK).centred());
+    canvas.text(x + length / 2.0, y + 27.0, &fit(name, 11.0, length - 70.0), set.colour(INK).centred());
     canvas.text(x + length, y + 27.0, &write(scale.high), set.right());
     if hatch {
         not_visited(canvas, x + length + 16.0, y + 12.5);
@@ -44,5 +44,5 @@ pub(super) fn bar(canvas: &Canvas<'_>, x: f64, y: f64, width: f64, scale: &Scale
 pub(super) fn not_visited(canvas: &Canvas<'_>, x: f64, y: f64) {
     canvas.hatch(x, y - 6.5, 18.0, 13.0);
     canvas.outline(x, y - 6.5, 18.0, 13.0, RULE, 0.8);
-    canvas.text(x + 24.0, y, "not visited", Type::new(10.5).colour(MUTED));
+    canvas.text(x + 24.0, y, "not visited", Type::new(11.0).colour(MUTED));
 }

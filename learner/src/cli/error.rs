@@ -1,7 +1,9 @@
 //! What a person reads when a command fails: one `error:` line, one `hint:` line with the next thing to do.
 
 use clap::error::{ContextKind, ContextValue, ErrorKind};
-use std::{io, process::ExitCode};
+use mazeway_client::{ClientError, Code};
+use mazeway_learner::{ServeError, store::StoreError};
+use std::{io, io::Write as _, process::ExitCode};
 
 /// Exit code of a failed command.
 const FAILURE: u8 = 1;
@@ -26,7 +28,6 @@ impl CliError {
     }
 
     /// The command was called wrongly.
-    #[expect(dead_code, reason = "the first caller comes with the other subcommands")]
     pub fn usage(message: impl Into<String>, hint: impl Into<String>) -> Self {
         Self { message: message.into(), hint: hint.into(), code: USAGE }
     }
@@ -34,8 +35,9 @@ impl CliError {
     /// Prints the error and gives the exit code.
     pub fn report(&self) -> ExitCode {
         if self.code != 0 {
-            eprintln!("error: {}", one_line(&self.message));
-            eprintln!("hint: {}", one_line(&self.hint));
+            let (message, hint) = (one_line(&self.message), one_line(&self.hint));
+            // Nobody is left to be told where standard error is closed.
+            let _ = write!(io::stderr(), "error: {message}\nhint: {hint}\n");
         }
         ExitCode::from(self.code)
     }
@@ -48,6 +50,58 @@ impl From<io::Error> for CliError {
             return Self { message: "standard output was closed".into(), hint: String::new(), code: 0 };
         }
         Self::failure(format!("could not write: {error}"), "check that the disk has room and that you may write there")
+    }
+}
+
+impl From<ClientError> for CliError {
+    fn from(error: ClientError) -> Self {
+        let message = match error.field() {
+            Some(field) if !error.to_string().contains(field) => format!("{field}: {error}"),
+            _ => error.to_string(),
+        };
+        let hint = match &error {
+            ClientError::Address { .. } => "give the address as HOST:PORT, such as 127.0.0.1:50052",
+            ClientError::Connect { .. } => {
+                "check the address, start a service with 'learner serve', or leave out --addr to use one started here"
+            }
+            _ => match error.code() {
+                Code::NotFound | Code::FailedPrecondition => "see what is stored with 'learner list'",
+                Code::InvalidArgument | Code::AlreadyExists => "see 'learner --help'",
+                Code::ResourceExhausted => "free some disk space, or raise the limit where the service is started",
+                Code::Unavailable | Code::Cancelled | Code::DeadlineExceeded => "try again; what was acknowledged is stored",
+                Code::DataLoss => "the data directory is damaged: restore it from a copy, or use another with --data DIR",
+                _ => "set RUST_LOG=info to see more",
+            },
+        };
+        Self::failure(message, hint)
+    }
+}
+
+impl From<StoreError> for CliError {
+    fn from(error: StoreError) -> Self {
+        let hint = match &error {
+            StoreError::Directory { .. } | StoreError::Foreign { .. } => "use another directory with --data DIR",
+            StoreError::NewerSchema { .. } => "install the newer release, or use another directory with --data DIR",
+            StoreError::DiskFull { .. } => "free some disk space, or use another directory with --data DIR",
+            StoreError::Busy { .. } => "stop the other program, or use another directory with --data DIR",
+            StoreError::Corrupt { .. } => "restore the directory from a copy, or use another with --data DIR",
+            StoreError::TrajectoryExists { .. }
+            | StoreError::AmbiguousFit { .. }
+            | StoreError::Closed
+            | StoreError::Database { .. } => "check that you may write there, or use another directory with --data DIR",
+        };
+        Self::failure(error.to_string(), hint)
+    }
+}
+
+impl From<ServeError> for CliError {
+    fn from(error: ServeError) -> Self {
+        match error {
+            ServeError::Store(error) => error.into(),
+            ServeError::Transport(_) | ServeError::Reflection(_) => {
+                Self::failure(error.to_string(), "set RUST_LOG=info to see more")
+            }
+        }
     }
 }
 

@@ -3,12 +3,15 @@
 //! Invariants: results go to standard output, everything else to standard error; a failure is one `error:` line and one
 //! `hint:` line; a closed pipe ends the program quietly.
 
+pub mod embedded;
 pub mod error;
 pub mod fit;
+mod serve;
 
 use clap::{Args, Parser, Subcommand};
+use directories::ProjectDirs;
 use error::CliError;
-use std::{path::PathBuf, process::ExitCode};
+use std::{path::PathBuf, process::ExitCode, time::Duration};
 use tracing_subscriber::EnvFilter;
 
 /// Watches experts act and works out what they want.
@@ -22,7 +25,9 @@ struct Cli {
 #[derive(Debug, Subcommand)]
 enum Command {
     /// Learn a reward and a policy from demonstrations, and report what was learned
-    Fit(fit::FitArgs),
+    Fit(Box<fit::FitArgs>),
+    /// Run the learner service
+    Serve(serve::ServeArgs),
 }
 
 /// Which recordings and fits a command works on.
@@ -31,9 +36,20 @@ pub struct StoreArgs {
     /// Directory of the recordings, models and fits [default: the platform's data directory]
     #[arg(long, value_name = "DIR", env = "MAZEWAY_DATA")]
     pub data: Option<PathBuf>,
-    /// Address of a running learner service, such as 127.0.0.1:50052, instead of one started for this command
-    #[arg(long, value_name = "HOST:PORT", conflicts_with = "data")]
+    /// Address of a running learner service, such as 127.0.0.1:50052, which has its own directory
+    #[arg(long, value_name = "HOST:PORT")]
     pub addr: Option<String>,
+}
+
+/// The data directory that is asked for, or the platform's.
+///
+/// # Errors
+/// The platform has none, as where no home directory is known.
+pub fn data_directory(asked: Option<PathBuf>) -> Result<PathBuf, CliError> {
+    let platform = || ProjectDirs::from("", "", "mazeway").map(|project| project.data_dir().to_owned());
+    asked.or_else(platform).ok_or_else(|| {
+        CliError::failure("no data directory is known: there is no home directory", "name one with --data DIR")
+    })
 }
 
 /// Parses the arguments, runs the command and says how it went.
@@ -54,7 +70,10 @@ pub fn main() -> ExitCode {
             .report();
         }
     };
-    match runtime.block_on(run(cli.command)) {
+    let outcome = runtime.block_on(run(cli.command));
+    // A fit that was cut off ends at its next iteration; nobody waits for it.
+    runtime.shutdown_timeout(Duration::from_secs(2));
+    match outcome {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => error.report(),
     }
@@ -62,6 +81,7 @@ pub fn main() -> ExitCode {
 
 async fn run(command: Command) -> Result<(), CliError> {
     match command {
-        Command::Fit(args) => fit::run(args).await,
+        Command::Fit(args) => fit::run(*args).await,
+        Command::Serve(args) => serve::run(args).await,
     }
 }

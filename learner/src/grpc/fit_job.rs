@@ -2,6 +2,7 @@
 
 use super::{from_proto, options, status::CallError};
 use crate::{
+    eval,
     irl::{self, FitError, FitOptions, Method, Problem, TraceEntry},
     mdp::TabularMdp,
     statistics::{Statistics, StatisticsBuilder},
@@ -115,12 +116,6 @@ impl FitJob {
 
     fn describe(self, model: &Model, data: Data, fit: &irl::Fit, fit_secs: f64) -> pb::Fit {
         let counts = data.statistics.counts(None);
-        let steps = data.statistics.n_steps(None);
-        // Pairs that were not seen count nothing, whatever the policy says of them.
-        let mean = |value: &dyn Fn(usize) -> f64| {
-            let seen = counts.iter().enumerate().filter(|&(_, &n)| n > 0.0);
-            seen.map(|(pair, n)| n * value(pair)).sum::<f64>() / steps as f64
-        };
         pb::Fit {
             fit_id: Uuid::new_v4().to_string(),
             created_at: None,
@@ -131,7 +126,7 @@ impl FitJob {
             n_states: model.header().n_states,
             n_actions: model.header().n_actions,
             trajectory_ids: data.trajectory_ids,
-            steps,
+            steps: data.statistics.n_steps(None),
             weights: pack_f64(&fit.weights),
             standard_errors: fit.standard_errors.as_deref().map(pack_f64).unwrap_or_default(),
             reward: pack_f64(&fit.reward),
@@ -144,8 +139,8 @@ impl FitJob {
             iterations: fit.iterations,
             fit_secs,
             warnings: fit.warnings.clone(),
-            log_likelihood_per_step: mean(&|pair| fit.policy[pair].ln()),
-            agreement: mean(&|pair| fit.greedy_policy[pair]),
+            log_likelihood_per_step: eval::log_likelihood_per_step(&fit.policy, &counts),
+            agreement: eval::step_agreement(&fit.greedy_policy, &counts),
             states_covered: data.statistics.states_covered(None) as u32,
             request: Some(self.request),
         }

@@ -14,6 +14,7 @@ mod service;
 mod status;
 mod to_proto;
 
+pub use options::from_proto as fit_options;
 pub use serve::{ServeError, serve};
 pub use status::CallError;
 

@@ -34,7 +34,8 @@ pub async fn learner(data: &Path) -> Result<Embedded, CliError> {
 pub async fn environments() -> Result<Embedded, CliError> {
     let config = mazeway_server::Config::default();
     let serve = |listener, shutdown| async {
-        let failed = |error: mazeway_server::ServeError| CliError::failure(error.to_string(), "set RUST_LOG=info to see more");
+        let failed =
+            |error: mazeway_server::ServeError| CliError::failure(error.to_string(), "set RUST_LOG=info to see more");
         mazeway_server::serve(config, listener, shutdown).await.map_err(failed)
     };
     Embedded::start(serve).await
@@ -49,7 +50,10 @@ impl Embedded {
         E: Into<CliError>,
     {
         let no_port = |error: &dyn Display| {
-            CliError::failure(format!("no free port on 127.0.0.1: {error}"), "close programs that hold many connections")
+            CliError::failure(
+                format!("no free port on 127.0.0.1: {error}"),
+                "close programs that hold many connections",
+            )
         };
         let listener = TcpListener::bind("127.0.0.1:0").await.map_err(|e| no_port(&e))?;
         let address = listener.local_addr().map_err(|e| no_port(&e))?;
@@ -76,9 +80,9 @@ impl Embedded {
     /// It failed meanwhile.
     pub async fn stop(self) -> Result<(), CliError> {
         drop(self.stop);
-        self.task
-            .await
-            .unwrap_or_else(|error| Err(CliError::failure(format!("a service failed: {error}"), "report this as a defect")))
+        self.task.await.unwrap_or_else(|error| {
+            Err(CliError::failure(format!("a service failed: {error}"), "report this as a defect"))
+        })
     }
 }
 

@@ -68,8 +68,12 @@ impl From<ClientError> for CliError {
                 Code::NotFound | Code::FailedPrecondition => "see what is stored with 'learner list'",
                 Code::InvalidArgument | Code::AlreadyExists => "see 'learner --help'",
                 Code::ResourceExhausted => "free some disk space, or raise the limit where the service is started",
-                Code::Unavailable | Code::Cancelled | Code::DeadlineExceeded => "try again; what was acknowledged is stored",
-                Code::DataLoss => "the data directory is damaged: restore it from a copy, or use another with --data DIR",
+                Code::Unavailable | Code::Cancelled | Code::DeadlineExceeded => {
+                    "try again; what was acknowledged is stored"
+                }
+                Code::DataLoss => {
+                    "the data directory is damaged: restore it from a copy, or use another with --data DIR"
+                }
                 _ => "set RUST_LOG=info to see more",
             },
         };

@@ -139,14 +139,10 @@ fn usage_error(error: &clap::Error) -> CliError {
     let mut suggestions = values(ContextKind::SuggestedSubcommand);
     suggestions.extend(values(ContextKind::SuggestedArg));
     suggestions.extend(values(ContextKind::SuggestedValue));
-    // The usage line reads "Usage: learner fit [OPTIONS]": its leading lower-case words are the command to ask.
-    let command = text.lines().find_map(|line| line.strip_prefix("Usage: ")).map_or_else(
-        || "learner".to_owned(),
-        |usage| {
-            let words = usage.split(' ').take_while(|w| w.chars().all(|c| c.is_ascii_lowercase() || c == '-'));
-            words.filter(|w| !w.starts_with('-')).collect::<Vec<_>>().join(" ")
-        },
-    );
+    let command = match std::env::args().nth(1) {
+        Some(word) if super::is_command(&word) => format!("learner {word}"),
+        _ => "learner".to_owned(),
+    };
     let hint = if suggestions.is_empty() {
         format!("see '{command} --help'")
     } else {

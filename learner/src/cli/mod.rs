@@ -8,7 +8,7 @@ pub mod error;
 pub mod fit;
 mod serve;
 
-use clap::{Args, Parser, Subcommand};
+use clap::{Args, CommandFactory as _, Parser, Subcommand};
 use directories::ProjectDirs;
 use error::CliError;
 use std::{path::PathBuf, process::ExitCode, time::Duration};
@@ -39,6 +39,11 @@ pub struct StoreArgs {
     /// Address of a running learner service, such as 127.0.0.1:50052, which has its own directory
     #[arg(long, value_name = "HOST:PORT")]
     pub addr: Option<String>,
+}
+
+/// Whether a word names a command.
+fn is_command(word: &str) -> bool {
+    Cli::command().get_subcommands().any(|command| command.get_name() == word)
 }
 
 /// The data directory that is asked for, or the platform's.

@@ -57,6 +57,12 @@ impl<'a> Likelihood<'a> {
     /// With J_b = dV/dw_b = M⁻¹ Σ_a π Φ_b and g_b = dQ/dw_b = Φ_b + γ P J_b, the second derivative of V solves M V'' = Cov_π(g_b,
     /// g_c) state by state, so d²ℓ/dw_b dw_c = Σ_s v(s) Cov_{a ~ π(s)}(g_b, g_c) with the v of the gradient.
     pub fn hessian(&mut self, weights: &[f64]) -> DMatrix<f64> {
+        self.hessian_and_terms(weights).0
+    }
+
+    /// The Hessian, and for each b the sum of the absolute terms whose differences make its diagonal entry: rounding hides
+    /// anything much smaller.
+    pub(super) fn hessian_and_terms(&mut self, weights: &[f64]) -> (DMatrix<f64>, Vec<f64>) {
         self.solver.solve(&self.basis.reward(weights));
         let (mdp, n_basis, n_actions) = (self.mdp, self.basis.len(), self.mdp.n_actions());
         let policy = self.solver.policy();
@@ -68,12 +74,14 @@ impl<'a> Likelihood<'a> {
         }
         let sensitivities: Vec<Vec<f64>> = received.iter().map(|b| resolvent.solve(b)).collect();
         let mut hessian = DMatrix::zeros(n_basis, n_basis);
+        let mut terms = vec![0.0; n_basis];
         let mut centred = DMatrix::zeros(n_basis, n_actions);
         for state in 0..mdp.n_states() {
             for action in 0..n_actions {
                 let pair = mdp.pair(state, action);
                 for (b, sensitivity) in sensitivities.iter().enumerate() {
                     centred[(b, action)] = self.discount * mdp.expected(pair, sensitivity) - sensitivity[state];
+                    terms[b] += (v[state] * policy[pair]).abs() * sensitivity[state].powi(2);
                 }
                 self.basis.for_each(pair, |b, value| centred[(b, action)] += value);
             }
@@ -82,7 +90,7 @@ impl<'a> Likelihood<'a> {
             });
             hessian.gemm(1.0, &weighted, &centred.transpose(), 1.0);
         }
-        hessian
+        (hessian, terms)
     }
 
     /// Soft values and policy of the weights last evaluated.

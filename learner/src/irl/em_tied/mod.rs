@@ -4,6 +4,9 @@
 //! θ = wᵀΦ (any temperature is part of w), and the objective Σ_l Σ_n log π_w(a_n|s_n) − penalty is maximised by a
 //! quasi-Newton method with bounds. With free weights and no penalty this is the maximum-likelihood estimator of dynamic
 //! discrete choice (Rust 1987), and standard errors come from the exact Hessian.
+//!
+//! The greedy policy takes the best actions under the soft Q itself, not those of a hard planner on the learned reward: the
+//! two agree where the reward is large against the temperature, and where data are few the soft one follows them better.
 
 mod likelihood;
 mod standard_errors;
@@ -12,7 +15,7 @@ pub use likelihood::Likelihood;
 pub use standard_errors::{MAX_STANDARD_ERRORS, standard_errors};
 
 use super::bounded::{self, Settings};
-use super::{Basis, Fit, FitError, Method, Penalty, Problem, Progress, Trace};
+use super::{Basis, Fit, FitError, Method, Penalty, PlannerKind, Problem, Progress, Trace};
 use crate::mdp::Policy;
 
 /// The policy tied to the reward.
@@ -80,6 +83,10 @@ pub fn fit_with_basis(problem: &Problem<'_>, basis: &Basis, progress: Progress<'
     let weights = minimum.x;
     likelihood.value_and_gradient(&weights);
     let mut warnings = Vec::new();
+    if matches!(options.planner, PlannerKind::PolicyIteration | PlannerKind::ExpectationMaximization) {
+        warnings
+            .push("em-tied has no planner to choose: its policy is the soft-optimal one by construction".to_owned());
+    }
     let mut errors = None;
     if options.penalty == Penalty::None {
         if basis.len() <= MAX_STANDARD_ERRORS {

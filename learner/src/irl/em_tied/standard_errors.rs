@@ -7,17 +7,22 @@ use nalgebra::SymmetricEigen;
 pub const MAX_STANDARD_ERRORS: usize = 1000;
 /// Eigenvalues below this share of the largest count as zero: the data say nothing along them.
 const RELATIVE_RANK: f64 = 1e-10;
-/// Share of a weight's direction that may lie where the data say nothing.
-const LEAKAGE: f64 = 1e-6;
+/// A diagonal entry below this share of the terms it is made of is rounding: squares of relative errors of 1e-10.
+const ROUNDING: f64 = 1e-20;
+/// Share of a weight's variance that may hide in directions of which the data say nothing.
+const HIDDEN: f64 = 0.1;
 
 /// Square roots of the diagonal of the pseudo-inverse of −d²ℓ/dw², shape (`n_basis`,).
 ///
 /// A reward is identified only up to directions that leave the policy unchanged (a constant, unvisited states). A weight with
 /// a part in such a direction has an infinite standard error: it is undetermined.
 pub fn standard_errors(likelihood: &mut Likelihood<'_>, weights: &[f64]) -> Vec<f64> {
-    let information = -likelihood.hessian(weights);
+    let (hessian, terms) = likelihood.hessian_and_terms(weights);
+    let information = -hessian;
     // scaled to a unit diagonal, so that the rank does not depend on the features' units
-    let scale: Vec<f64> = information.diagonal().iter().map(|&d| if d > 0.0 { d.sqrt() } else { 0.0 }).collect();
+    let diagonal = information.diagonal();
+    let scale: Vec<f64> =
+        diagonal.iter().zip(terms).map(|(&d, terms)| if d > ROUNDING * terms { d.sqrt() } else { 0.0 }).collect();
     let n = scale.len();
     let mut scaled = information;
     for i in 0..n {
@@ -40,7 +45,10 @@ pub fn standard_errors(likelihood: &mut Likelihood<'_>, weights: &[f64]) -> Vec<
                     unknown += share;
                 }
             }
-            if scale[b] == 0.0 || unknown > LEAKAGE { f64::INFINITY } else { variance.sqrt() / scale[b] }
+            // along an unknown direction the variance is at least that of the smallest eigenvalue that counts
+            let hidden = unknown / (RELATIVE_RANK * largest);
+            let known = scale[b] > 0.0 && largest > 0.0 && hidden <= HIDDEN * variance;
+            if known { variance.sqrt() / scale[b] } else { f64::INFINITY }
         })
         .collect()
 }

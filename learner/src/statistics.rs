@@ -188,3 +188,57 @@ impl Statistics {
 pub fn expected_arrivals(mdp: &TabularMdp, counts: &[f64]) -> Vec<f64> {
     mdp.propagate(counts)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn trajectory(states: &[u32], actions: &[u32]) -> Trajectory {
+        Trajectory::new(states.to_vec(), actions.to_vec(), None, 9, 9).expect("a trajectory")
+    }
+
+    #[test]
+    fn counts_by_step() {
+        let mut builder = Statistics::builder(3, 2, Some(2));
+        builder.add(&trajectory(&[0, 1, 2], &[0, 1, 0])).expect("counted");
+        builder.add(&trajectory(&[0], &[1])).expect("counted");
+        builder.add(&trajectory(&[0, 2], &[0, 0])).expect("counted");
+        let statistics = builder.finish().expect("counts");
+        assert_eq!((statistics.n_trajectories(), statistics.longest()), (3, 2));
+        assert_eq!(statistics.step_counts(0), [(0, 2.0), (1, 1.0)]);
+        assert_eq!(statistics.step_counts(1), [(3, 1.0), (4, 1.0)]);
+        assert_eq!(statistics.step_counts(2), []);
+        assert_eq!(statistics.counts(None), [2.0, 1.0, 0.0, 1.0, 1.0, 0.0]);
+        assert_eq!(statistics.counts(Some(1)), [2.0, 1.0, 0.0, 0.0, 0.0, 0.0]);
+        assert_eq!(statistics.weighted_counts(2, |k| [1.0, 0.5][k]), [2.0, 1.0, 0.0, 0.5, 0.5, 0.0]);
+        assert_eq!(statistics.state_visits(None), [3.0, 1.0, 1.0]);
+        assert_eq!((statistics.n_steps(None), statistics.n_steps(Some(1))), (5, 3));
+        assert_eq!((statistics.states_covered(None), statistics.states_covered(Some(1))), (3, 1));
+    }
+
+    #[test]
+    fn memory_does_not_grow_with_the_data() {
+        let mut builder = Statistics::builder(3, 2, None);
+        for _ in 0..1000 {
+            builder.add(&trajectory(&[0, 1, 2], &[0, 1, 0])).expect("counted");
+        }
+        assert_eq!(builder.steps.iter().map(BTreeMap::len).sum::<usize>(), 3);
+    }
+
+    #[test]
+    fn a_wrong_trajectory_leaves_no_trace() {
+        let mut builder = Statistics::builder(3, 2, None);
+        builder.add(&trajectory(&[0], &[0])).expect("counted");
+        let before = builder.clone().finish();
+        assert!(matches!(builder.add(&trajectory(&[0, 3], &[0, 0])), Err(StatisticsError::OutOfRange { step: 1, .. })));
+        assert!(matches!(builder.add(&trajectory(&[0, 2], &[0, 2])), Err(StatisticsError::OutOfRange { step: 1, .. })));
+        assert_eq!(builder.finish(), before);
+        assert_eq!(Statistics::builder(3, 2, None).finish(), Err(StatisticsError::Empty));
+    }
+
+    #[test]
+    fn arrivals_follow_the_model() {
+        let mdp = TabularMdp::new(2, 1, vec![0, 2, 3], vec![0, 1, 1], vec![0.25, 0.75, 1.0], None).expect("a model");
+        assert_eq!(expected_arrivals(&mdp, &[4.0, 2.0]), [1.0, 5.0]);
+    }
+}

@@ -172,3 +172,37 @@ impl FromIterator<Trajectory> for Demonstrations {
         Self(trajectories.into_iter().collect())
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_no_trajectory_is_refused() {
+        let new =
+            |states: &[u32], actions: &[u32], last| Trajectory::new(states.to_vec(), actions.to_vec(), last, 3, 2);
+        assert_eq!(new(&[], &[], None), Err(TrajectoryError::Empty));
+        assert_eq!(new(&[0], &[], None), Err(TrajectoryError::Ragged { states: 1, actions: 0 }));
+        assert_eq!(
+            new(&[0, 3], &[0, 0], None),
+            Err(TrajectoryError::StateOutOfRange { step: 1, state: 3, n_states: 3 })
+        );
+        assert_eq!(new(&[0], &[0], Some(3)), Err(TrajectoryError::StateOutOfRange { step: 1, state: 3, n_states: 3 }));
+        assert_eq!(
+            new(&[0, 1], &[1, 2], None),
+            Err(TrajectoryError::ActionOutOfRange { step: 1, action: 2, n_actions: 2 })
+        );
+    }
+
+    #[test]
+    fn truncation_keeps_what_follows() {
+        let whole = Trajectory::new(vec![0, 1, 2], vec![1, 0, 1], Some(0), 3, 2).expect("a trajectory");
+        let short = whole.truncated(2);
+        assert_eq!(
+            (short.states(), short.actions(), short.final_state()),
+            ([0, 1].as_slice(), [1, 0].as_slice(), Some(2))
+        );
+        assert_eq!(whole.truncated(9), whole);
+        assert_eq!(whole.truncated(0).len(), 1);
+    }
+}

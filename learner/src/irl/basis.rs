@@ -126,3 +126,29 @@ impl Basis {
         projected
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rewards_and_projections_are_adjoint() {
+        let mdp = TabularMdp::new(2, 2, vec![0, 1, 2, 3, 4], vec![0, 1, 1, 0], vec![1.0; 4], None).expect("a model");
+        let table = [1.0, 0.0, -2.0, 0.0, 3.0, 0.5, 0.0, 0.0, 4.0, 1.0, 1.0, 1.0];
+        let all = [Basis::state(&mdp), Basis::state_action(&mdp), Basis::features(&mdp, 3, &table).expect("a basis")];
+        assert_eq!(all.each_ref().map(Basis::len), [2, 4, 3]);
+        for basis in all {
+            let weights: Vec<f64> = (0..basis.len()).map(|b| 1.0 + b as f64).collect();
+            let values = [0.5, -1.0, 2.0, 0.25];
+            let left: f64 = basis.reward(&weights).iter().zip(values).map(|(r, v)| r * v).sum();
+            let right: f64 = basis.project(&values).iter().zip(&weights).map(|(p, w)| p * w).sum();
+            assert!((left - right).abs() < 1e-12);
+        }
+        assert!(matches!(Basis::features(&mdp, 3, &table[1..]), Err(BasisError::Shape { .. })));
+        assert!(matches!(Basis::features(&mdp, 0, &[]), Err(BasisError::Shape { .. })));
+        assert!(matches!(
+            Basis::features(&mdp, 1, &[0.0, 0.0, f64::NAN, 0.0]),
+            Err(BasisError::NotFinite { row: 2, .. })
+        ));
+    }
+}

@@ -180,3 +180,69 @@ fn norm(a: &[f64]) -> f64 {
 fn max_abs(a: &[f64]) -> f64 {
     a.iter().fold(0.0, |m, x| f64::max(m, x.abs()))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn run(lower: f64, x: Vec<f64>, f: impl FnMut(&[f64]) -> (f64, Vec<f64>)) -> Minimum {
+        minimise(&Settings { lower, tolerance: 1e-14, max_iterations: 2000 }, x, f, |_, _| Ok(())).expect("a minimum")
+    }
+
+    #[test]
+    fn the_banana_with_and_without_a_bound() {
+        let banana = |x: &[f64]| {
+            let (a, b) = (1.0 - x[0], x[1] - x[0] * x[0]);
+            (a * a + 100.0 * b * b, vec![-2.0 * a - 400.0 * x[0] * b, 200.0 * b])
+        };
+        let found = run(f64::NEG_INFINITY, vec![-1.2, 1.0], banana);
+        assert_eq!(found.stopped, Stopped::Converged);
+        assert!(found.x.iter().all(|x| (x - 1.0).abs() < 1e-5), "{:?}", found.x);
+        // with x ≥ 1.5 the best is x₀ = 1.5 and x₁ = 2.25
+        let found = run(1.5, vec![3.0, 3.0], banana);
+        assert!((found.x[0] - 1.5).abs() < 1e-9 && (found.x[1] - 2.25).abs() < 1e-6, "{:?}", found.x);
+    }
+
+    #[test]
+    fn badly_scaled_bowls() {
+        let found = run(f64::NEG_INFINITY, vec![0.0, 0.0], |x| {
+            let (a, b) = (x[0] - 3.0, 1e4 * (x[1] - 2e-4));
+            (a * a + b * b, vec![2.0 * a, 2e4 * b])
+        });
+        assert!((found.x[0] - 3.0).abs() < 1e-6 && (found.x[1] - 2e-4).abs() < 1e-9, "{:?}", found.x);
+    }
+
+    #[test]
+    fn a_lying_gradient_stalls_and_a_call_back_cancels() {
+        let uphill = |x: &[f64]| (x[0], vec![-1.0]);
+        assert_eq!(run(f64::NEG_INFINITY, vec![0.0], uphill).stopped, Stopped::Stalled);
+        let settings = Settings { lower: 0.0, tolerance: 0.0, max_iterations: 10 };
+        let bowl = |x: &[f64]| (x[0] * x[0], vec![2.0 * x[0]]);
+        let cancelled = minimise(&settings, vec![5.0], bowl, |_, _| Err(FitError::Cancelled));
+        assert!(matches!(cancelled, Err(FitError::Cancelled)));
+        let one = Settings { max_iterations: 1, ..settings };
+        assert_eq!(minimise(&one, vec![5.0], bowl, |_, _| Ok(())).expect("a point").stopped, Stopped::MaxIterations);
+    }
+
+    proptest! {
+        #[test]
+        fn convex_quadratics_under_bounds(
+            factor in proptest::collection::vec(-1.0..1.0_f64, 36),
+            linear in proptest::collection::vec(-3.0..3.0_f64, 6),
+        ) {
+            // ½ xᵀ(FᵀF + 0.1 I)x − lᵀx over x ≥ 0
+            let gradient = |x: &[f64]| -> Vec<f64> {
+                let fx: Vec<f64> = (0..6).map(|i| dot(&factor[6 * i..6 * i + 6], x)).collect();
+                (0..6).map(|j| (0..6).map(|i| factor[6 * i + j] * fx[i]).sum::<f64>() + 0.1 * x[j] - linear[j]).collect()
+            };
+            let found = run(0.0, vec![1.0; 6], |x| {
+                let g = gradient(x);
+                (0.5 * (dot(&g, x) - dot(&linear, x)), g)
+            });
+            for (x, g) in found.x.iter().zip(gradient(&found.x)) {
+                prop_assert!(*x >= 0.0 && g >= -1e-5 && (*x == 0.0 || g.abs() < 1e-5), "slope {g} at {x}");
+            }
+        }
+    }
+}

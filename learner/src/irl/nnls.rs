@@ -183,3 +183,87 @@ impl Factor {
         z
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn matrix(rows: usize, columns: usize, entries: &[f64]) -> DMatrix<f64> {
+        DMatrix::from_iterator(rows, columns, entries.iter().copied().cycle().take(rows * columns))
+    }
+
+    /// x ≥ 0, no gradient where x > 0, none that x could follow elsewhere.
+    fn assert_optimal(a: &DMatrix<f64>, b: &DVector<f64>, found: &Nnls) {
+        assert!(found.converged);
+        let residual = b - product(a, &found.solution);
+        assert!((residual.norm() - found.residual_norm).abs() < 1e-9);
+        for (column, &x) in a.column_iter().zip(&found.solution) {
+            let gradient = column.dot(&residual);
+            let scale = 1e-8 * (1.0 + column.norm() * b.norm());
+            assert!(x >= 0.0);
+            assert!(gradient <= scale, "gradient {gradient} at {x}");
+            assert!(x == 0.0 || gradient >= -scale, "gradient {gradient} at {x}");
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn agrees_with_the_judge(
+            (rows, columns) in (1_usize..12, 1_usize..12),
+            entries in proptest::collection::vec(-3.0..3.0_f64, 144),
+            sides in proptest::collection::vec(-3.0..3.0_f64, 12),
+        ) {
+            let a = matrix(rows, columns, &entries);
+            let b = DVector::from_column_slice(&sides[..rows]);
+            let found = nnls(&a, &b);
+            assert_optimal(&a, &b, &found);
+            let judge_a = ndarray::Array2::from_shape_fn((rows, columns), |(i, j)| a[(i, j)]);
+            let judge_b = ndarray::Array1::from_iter(b.iter().copied());
+            let (judge, norm) = ::nnls::nnls(judge_a.view(), judge_b.view());
+            prop_assert!((norm - found.residual_norm).abs() < 1e-8, "residual {norm}, got {}", found.residual_norm);
+            // with more rows than columns the solution is unique
+            if rows >= columns {
+                for (x, y) in judge.iter().zip(&found.solution) {
+                    prop_assert!((x - y).abs() < 1e-6 * (1.0 + x.abs()), "{judge} and {:?}", found.solution);
+                }
+            }
+        }
+
+        #[test]
+        fn copes_with_dependent_columns(
+            rows in 2_usize..10,
+            entries in proptest::collection::vec(-2_i32..3, 100),
+            sides in proptest::collection::vec(-3_i32..4, 10),
+        ) {
+            // small integers: repeated, opposite and zero columns are common
+            let entries: Vec<f64> = entries.into_iter().map(f64::from).collect();
+            let a = matrix(rows, 10, &entries);
+            let b = DVector::from_iterator(rows, sides.into_iter().take(rows).map(f64::from));
+            assert_optimal(&a, &b, &nnls(&a, &b));
+        }
+
+        #[test]
+        fn columns_of_any_unit(exponents in proptest::collection::vec(-4_i32..5, 6), entries in proptest::collection::vec(-3.0..3.0_f64, 48)) {
+            let mut a = matrix(8, 6, &entries);
+            let b = DVector::from_fn(8, |i, _| entries[47 - i]);
+            let plain = nnls(&a, &b);
+            for (j, &e) in exponents.iter().enumerate() {
+                a.column_mut(j).scale_mut(10_f64.powi(e));
+            }
+            let scaled = nnls(&a, &b);
+            prop_assert!((plain.residual_norm - scaled.residual_norm).abs() < 1e-9);
+            for ((x, y), &e) in plain.solution.iter().zip(&scaled.solution).zip(&exponents) {
+                prop_assert!((x - y * 10_f64.powi(e)).abs() < 1e-7 * (1.0 + x.abs()));
+            }
+        }
+    }
+
+    #[test]
+    fn nothing_to_gain() {
+        let a = matrix(2, 2, &[1.0, 0.0, 0.0, 1.0]);
+        assert_eq!(nnls(&a, &DVector::from_column_slice(&[-1.0, -2.0])).solution, [0.0, 0.0]);
+        assert_eq!(nnls(&a, &DVector::zeros(2)).solution, [0.0, 0.0]);
+        assert_eq!(nnls(&DMatrix::zeros(2, 2), &DVector::from_column_slice(&[1.0, 2.0])).solution, [0.0, 0.0]);
+    }
+}

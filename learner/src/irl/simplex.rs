@@ -36,3 +36,49 @@ pub(super) fn minimise(linear: &[f64], curvature: &[f64]) -> Vec<f64> {
     }
     weights
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn satisfies_the_optimality_conditions(
+            terms in proptest::collection::vec((0.0..5.0_f64, 0.0..5.0_f64, any::<bool>()), 1..20)
+        ) {
+            // a function that was never demonstrated has neither term
+            let linear: Vec<f64> = terms.iter().map(|t| if t.2 { t.0 } else { 0.0 }).collect();
+            let curvature: Vec<f64> = terms.iter().map(|t| if t.2 { t.1 + 1e-3 } else { 0.0 }).collect();
+            let w = minimise(&linear, &curvature);
+            prop_assert!((w.iter().sum::<f64>() - 1.0).abs() < 1e-9, "{w:?}");
+            let slopes: Vec<f64> = w.iter().zip(&linear).zip(&curvature).map(|((w, l), c)| l - c * w).collect();
+            let active = w.iter().zip(&slopes).filter(|(w, _)| **w > 1e-9).map(|(_, s)| *s);
+            let multiplier = active.clone().fold(f64::NEG_INFINITY, f64::max);
+            prop_assert!(active.clone().all(|s| (s - multiplier).abs() < 1e-7), "{w:?} {slopes:?}");
+            prop_assert!(w.iter().zip(&slopes).all(|(w, s)| *w >= 0.0 && *s <= multiplier + 1e-7), "{w:?} {slopes:?}");
+        }
+
+        #[test]
+        fn counts_follow_the_closed_form(counts in proptest::collection::vec(0.01..50.0_f64, 1..20)) {
+            let w = minimise(&counts, &counts);
+            let mut sorted = counts.clone();
+            sorted.sort_by(|a, b| b.total_cmp(a));
+            let multipliers = (1..=sorted.len()).map(|m| {
+                (m, (m as f64 - 1.0) / sorted[..m].iter().map(|c| 1.0 / c).sum::<f64>())
+            });
+            let (_, multiplier) = multipliers.filter(|&(m, l)| sorted[m - 1] > l).last().expect("the first always counts");
+            for (w, c) in w.iter().zip(&counts) {
+                prop_assert!((w - (1.0 - multiplier / c).max(0.0)).abs() < 1e-9);
+            }
+        }
+    }
+
+    #[test]
+    fn what_nobody_wants_goes_to_what_was_never_shown() {
+        assert_eq!(minimise(&[0.5, 0.0, 0.0], &[1.0, 0.0, 0.0]), [0.5, 0.25, 0.25]);
+        assert_eq!(minimise(&[0.0, 0.0], &[0.0, 0.0]), [0.5, 0.5]);
+        // no data left at all: weights follow 1/counts
+        assert_eq!(minimise(&[0.0, 0.0], &[1.0, 3.0]), [0.75, 0.25]);
+    }
+}

@@ -61,3 +61,33 @@ pub(super) fn most_likely_boltzmann(n_actions: usize, action_values: &[f64], cou
     }
     (Policy::boltzmann(n_actions, action_values, low), low)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn finds_the_temperature_that_made_the_counts() {
+        let action_values = [1.0, 0.0, 0.5, 3.0, 3.2, 2.0];
+        let truth = Policy::boltzmann(3, &action_values, 2.5);
+        let counts: Vec<f64> = truth.probabilities().iter().map(|p| 1e6 * p).collect();
+        let (policy, beta) = most_likely_boltzmann(3, &action_values, &counts);
+        assert!((beta - 2.5).abs() < 1e-9);
+        assert!(policy.probabilities().iter().zip(truth.probabilities()).all(|(a, b)| (a - b).abs() < 1e-9));
+        // values in another unit change the temperature and not the policy
+        let scaled: Vec<f64> = action_values.iter().map(|q| 1e-9 * q + 7e-9).collect();
+        let (same, _) = most_likely_boltzmann(3, &scaled, &counts);
+        assert!(policy.probabilities().iter().zip(same.probabilities()).all(|(a, b)| (a - b).abs() < 1e-6));
+    }
+
+    #[test]
+    fn the_ends_of_the_scale() {
+        let counts = [5.0, 0.0];
+        let (sure, _) = most_likely_boltzmann(2, &[1.0, 0.0], &counts);
+        assert_eq!(sure.probabilities(), [1.0, 0.0]);
+        let (against, beta) = most_likely_boltzmann(2, &[0.0, 1.0], &counts);
+        assert_eq!((against.probabilities(), beta), ([0.5, 0.5].as_slice(), 0.0));
+        let (flat, beta) = most_likely_boltzmann(2, &[1e9, 1e9], &counts);
+        assert_eq!((flat.probabilities(), beta), ([0.5, 0.5].as_slice(), 0.0));
+    }
+}

@@ -265,3 +265,55 @@ impl Dense {
         x.as_slice().to_vec()
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rand_core::Rng;
+    use rand_pcg::Pcg64;
+
+    /// `n` states in a ring with jumps, two actions.
+    fn ring(n: usize, random: &mut Pcg64) -> TabularMdp {
+        let (mut offsets, mut next, mut probabilities) = (vec![0], Vec::new(), Vec::new());
+        for pair in 0..2 * n {
+            let mut row = vec![(pair / 2) as u32, ((pair / 2 + 1) % n) as u32, (random.next_u64() % n as u64) as u32];
+            row.sort_unstable();
+            row.dedup();
+            let p = 1.0 / row.len() as f64;
+            probabilities.extend(row.iter().map(|_| p));
+            next.extend(row);
+            offsets.push(next.len());
+        }
+        TabularMdp::new(n, 2, offsets, next, probabilities, None).expect("a model")
+    }
+
+    #[test]
+    fn all_ways_to_solve_agree() {
+        let mut random = Pcg64::new(1, 2);
+        for n in [1, 2, 50, DENSE_STATES + 60] {
+            let mdp = ring(n, &mut random);
+            let policy = vec![0.5; 2 * n];
+            let b: Vec<f64> = (0..n).map(|i| (i as f64).sin()).collect();
+            for discount in [0.0, 0.9, 0.9999] {
+                let resolvent = Resolvent::new(&mdp, &policy, discount);
+                let dense = Dense::new(&resolvent.chain, discount);
+                for transposed in [false, true] {
+                    let want = dense.solve(&b, transposed);
+                    let (iterated, converged) = resolvent.bicgstab(&b, transposed);
+                    assert!(converged, "{n} states, discount {discount}");
+                    // sweeps from afar are what the others exist to avoid: from close by they must not wander off
+                    let near = want.iter().map(|x| x + 1e-6).collect();
+                    let swept = resolvent.sweeps(&b, transposed, near);
+                    let size = max_abs(&want);
+                    for ((w, i), s) in want.iter().zip(&iterated).zip(&swept) {
+                        assert!((w - i).abs() <= 1e-9 * size, "{n} states, discount {discount}: {w} and {i}");
+                        assert!((w - s).abs() <= 1e-8 * size, "{n} states, discount {discount}: {w} and {s}");
+                    }
+                    let mut back = vec![0.0; n];
+                    resolvent.apply(&want, transposed, &mut back);
+                    assert!(back.iter().zip(&b).all(|(x, y)| (x - y).abs() <= 1e-12 * (1.0 + size)));
+                }
+            }
+        }
+    }
+}

@@ -118,3 +118,38 @@ impl Policy {
         self.probabilities
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn ties_are_split_by_relative_size() {
+        let values = [1.0, 1.0, 0.5, 0.0, 0.0, 1e-12];
+        let greedy = Policy::greedy(3, &values);
+        assert_eq!(greedy.row(0), [0.5, 0.5, 0.0]);
+        assert_eq!(greedy.row(1), [1.0 / 3.0; 3]);
+        // the unit of the values does not matter
+        for unit in [1e-6, 1e6] {
+            let scaled: Vec<f64> = values.iter().map(|v| unit * v).collect();
+            assert_eq!(Policy::greedy(3, &scaled), greedy);
+        }
+        assert_eq!(Policy::greedy(2, &[0.0; 4]), Policy::uniform(2, 2));
+    }
+
+    #[test]
+    fn boltzmann_has_no_overflow() {
+        let sharp = Policy::boltzmann(2, &[1e300, 0.0, -1e300, -1e300], 1.0);
+        assert_eq!(sharp.probabilities(), [1.0, 0.0, 0.5, 0.5]);
+    }
+
+    #[test]
+    fn rows_are_checked() {
+        assert!(Policy::new(2, vec![0.5, 0.5]).is_ok());
+        assert!(matches!(Policy::new(2, vec![0.5; 3]), Err(PolicyError::Length { .. })));
+        assert!(matches!(Policy::new(0, vec![]), Err(PolicyError::Length { .. })));
+        assert!(matches!(Policy::new(2, vec![1.0, 0.0, 0.5, 0.4]), Err(PolicyError::Row { state: 1, .. })));
+        assert!(matches!(Policy::new(2, vec![2.0, -1.0]), Err(PolicyError::Row { state: 0, .. })));
+        assert!(matches!(Policy::new(2, vec![f64::NAN, 1.0]), Err(PolicyError::Row { state: 0, .. })));
+    }
+}

@@ -257,3 +257,54 @@ impl TabularMdp {
         arrivals
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    type Parts = (usize, usize, Vec<usize>, Vec<u32>, Vec<f64>, Option<Vec<f64>>);
+
+    fn parts() -> Parts {
+        (2, 1, vec![0, 2, 3], vec![0, 1, 1], vec![0.25, 0.75, 1.0], None)
+    }
+
+    fn error(change: impl FnOnce(&mut Parts)) -> MdpError {
+        let mut parts = parts();
+        change(&mut parts);
+        TabularMdp::new(parts.0, parts.1, parts.2, parts.3, parts.4, parts.5).expect_err("a refusal")
+    }
+
+    #[test]
+    fn keeps_what_is_right() {
+        let (n, a, offsets, next, probabilities, _) = parts();
+        let mdp = TabularMdp::new(n, a, offsets, next, probabilities, None).expect("a model");
+        assert_eq!((mdp.n_states(), mdp.n_actions(), mdp.n_pairs()), (2, 1, 2));
+        assert_eq!(mdp.initial_distribution(), [0.5, 0.5]);
+        assert_eq!(mdp.row(0), ([0, 1].as_slice(), [0.25, 0.75].as_slice()));
+        assert_eq!(mdp.action_values(&[1.0, 2.0], 0.5, &[4.0, 8.0]), [1.0 + 0.5 * 7.0, 2.0 + 0.5 * 8.0]);
+        assert_eq!(mdp.propagate(&[4.0, 1.0]), [1.0, 4.0]);
+    }
+
+    #[test]
+    fn names_what_is_wrong() {
+        assert!(matches!(error(|p| p.0 = 0), MdpError::Empty { .. }));
+        assert!(matches!(error(|p| p.0 = usize::MAX), MdpError::TooLarge { .. }));
+        assert!(matches!(error(|p| p.0 = 3), MdpError::RowOffsets { expected: 4, .. }));
+        assert!(matches!(error(|p| p.2[0] = 1), MdpError::RowOffsets { .. }));
+        assert!(matches!(error(|p| p.2[1] = 4), MdpError::RowOffsets { .. }));
+        assert!(matches!(error(|p| p.2[2] = 2), MdpError::RowOffsets { .. }));
+        assert!(matches!(error(|p| p.4.truncate(2)), MdpError::Ragged { next_states: 3, probabilities: 2 }));
+        assert!(matches!(error(|p| p.3[1] = 2), MdpError::NextState { state: 0, next_state: 2, .. }));
+        assert!(matches!(error(|p| p.3[1] = 0), MdpError::NextState { state: 0, next_state: 0, .. }));
+        for wrong in [-0.25, 1.5, f64::NAN, f64::INFINITY] {
+            assert!(matches!(error(|p| p.4[0] = wrong), MdpError::Probability { state: 0, action: 0, .. }));
+        }
+        assert!(matches!(error(|p| p.4[2] = 0.999), MdpError::RowSum { state: 1, action: 0, .. }));
+        assert!(matches!(error(|p| p.2[1] = 0), MdpError::RowSum { state: 0, .. }));
+        assert!(matches!(error(|p| p.5 = Some(vec![1.0])), MdpError::InitialLength { expected: 2, got: 1 }));
+        assert!(matches!(error(|p| p.5 = Some(vec![0.5, 0.4])), MdpError::InitialDistribution { .. }));
+        assert!(matches!(error(|p| p.5 = Some(vec![1.5, -0.5])), MdpError::InitialDistribution { .. }));
+        let message = error(|p| p.4[2] = 0.5).to_string();
+        assert_eq!(message, "expected row (state 1, action 0) to sum to 1, got 0.5");
+    }
+}

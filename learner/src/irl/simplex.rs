@@ -67,7 +67,7 @@ mod tests {
             let multipliers = (1..=sorted.len()).map(|m| {
                 (m, (m as f64 - 1.0) / sorted[..m].iter().map(|c| 1.0 / c).sum::<f64>())
             });
-            let (_, multiplier) = multipliers.filter(|&(m, l)| sorted[m - 1] > l).last().expect("the first always counts");
+            let (_, multiplier) = multipliers.filter(|&(m, l)| sorted[m - 1] > l).next_back().expect("the first always counts");
             for (w, c) in w.iter().zip(&counts) {
                 prop_assert!((w - (1.0 - multiplier / c).max(0.0)).abs() < 1e-9);
             }

@@ -302,7 +302,7 @@ mod tests {
                     let (iterated, converged) = resolvent.bicgstab(&b, transposed);
                     assert!(converged, "{n} states, discount {discount}");
                     // sweeps from afar are what the others exist to avoid: from close by they must not wander off
-                    let near = want.iter().map(|x| x + 1e-6).collect();
+                    let near = want.iter().map(|x| x * (1.0 + 1e-6)).collect();
                     let swept = resolvent.sweeps(&b, transposed, near);
                     let size = max_abs(&want);
                     for ((w, i), s) in want.iter().zip(&iterated).zip(&swept) {

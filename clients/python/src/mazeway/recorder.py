@@ -1,0 +1,273 @@
+"""`Recorder`: a Gymnasium wrapper that records episodes into the learner."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import time
+from typing import Any, SupportsFloat
+
+import gymnasium
+import numpy as np
+
+from mazeway import _wire
+from mazeway._session import DEFAULT_TIMEOUT_SECS
+from mazeway._transport import Exchange, Transport, connect
+from mazeway.client import Client
+from mazeway.env import MazewayEnv, server_env_id
+from mazeway.errors import (
+    AlreadyExistsError,
+    DeadlineExceededError,
+    InvalidArgumentError,
+    MazewayError,
+    ServerUnreachableError,
+)
+from mazeway.learner import DEFAULT_LEARNER_ADDRESS, Learner
+from mazeway.model import Model
+from mazeway.trajectory import Trajectory
+
+_RETRY_SECS = 0.2
+
+
+class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordConstructorArgs):
+    """Records the episodes of any environment with Discrete observations and actions.
+
+    An episode is sent when it ends, and is on the learner's stable storage before the next `reset`
+    returns; `flush` waits for it earlier, `close` sends the last, unfinished episode too. Where the
+    learner cannot be reached, the call tries again until `timeout` and then raises; the episodes stay in
+    `pending` and go out, under the same ids and so stored once, with the next `reset`, `flush` or
+    `close`.
+    """
+
+    def __init__(
+        self,
+        env: gymnasium.Env[Any, Any],
+        style: str,
+        address: str = DEFAULT_LEARNER_ADDRESS,
+        env_id: str | None = None,
+        model_id: str | None = "",
+        *,
+        source: str = "python",
+        timeout: float = DEFAULT_TIMEOUT_SECS,
+    ) -> None:
+        """Wraps an environment; nothing is sent yet.
+
+        Args:
+            env: The environment.
+            style: What the demonstrator is after, such as "aggressive".
+            address: "host:port" of the learner.
+            env_id: Name to record under; None is the environment's own.
+            model_id: Model in which the episodes were made. Empty: the environment's own model, where
+                it has one (Mazeway's environments, and those with a toy-text table `P`), is put into
+                the learner. None: none.
+            source: Who acts.
+            timeout: Longest wait for the learner, in seconds.
+        """
+        gymnasium.utils.RecordConstructorArgs.__init__(
+            self,
+            style=style,
+            address=address,
+            env_id=env_id,
+            model_id=model_id,
+            source=source,
+            timeout=timeout,
+        )
+        gymnasium.Wrapper.__init__(self, env)
+        observations, actions = env.observation_space, env.action_space
+        for name, space in (("observation", observations), ("action", actions)):
+            if not isinstance(space, gymnasium.spaces.Discrete):
+                raise InvalidArgumentError(
+                    f"expected a Discrete {name} space, got {space}", field=f"{name}_space"
+                )
+        if not style:
+            raise InvalidArgumentError("style: expected a name, got an empty one", field="style")
+        self.style = style
+        self.learner_address = address
+        self.recorded_env_id = env_id or _env_id(env)
+        self.model_id = model_id
+        self.source = source
+        self._n_states, self._first_state = int(observations.n), int(observations.start)
+        self._n_actions, self._first_action = int(actions.n), int(actions.start)
+        self._uploader = _Uploader(address, timeout)
+        self._timeout = timeout
+        self._forget()
+
+    @property
+    def pending(self) -> list[Trajectory]:
+        """Episodes that the learner has not acknowledged."""
+        return list(self._uploader.pending.values())
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Sends what was recorded, waits until it is stored, and begins an episode."""
+        self._end_episode()
+        if self.model_id == "":
+            self.model_id = self._put_model()
+        self._uploader.flush()
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._states.append(self._state(observation))
+        return observation, info
+
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        """Steps, and sends the episode where it ends."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        if self._states:  # between an end and the next reset there is no episode
+            self._actions.append(int(action) - self._first_action)
+            self._rewards.append(float(reward))
+            self._states.append(self._state(observation))
+            self._terminated, self._truncated = bool(terminated), bool(truncated)
+            if terminated or truncated:
+                self._end_episode()
+        return observation, reward, terminated, truncated, info
+
+    def flush(self) -> None:
+        """Waits until every episode that has ended is on the learner's stable storage."""
+        self._uploader.flush()
+
+    def close(self) -> None:
+        """Records the unfinished episode, waits until all is stored, and closes the environment."""
+        try:
+            self._end_episode()
+            self._uploader.flush()
+            self._uploader.close()
+        finally:
+            self.env.close()
+
+    def _forget(self) -> None:
+        self._states: list[int] = []
+        self._actions: list[int] = []
+        self._rewards: list[float] = []
+        self._terminated = self._truncated = False
+
+    def _state(self, observation: Any) -> int:
+        return int(observation) - self._first_state
+
+    def _end_episode(self) -> None:
+        """Queues the episode, where it has a step; does not wait."""
+        if self._actions:
+            self._uploader.send(
+                Trajectory(
+                    env_id=self.recorded_env_id,
+                    style=self.style,
+                    n_states=self._n_states,
+                    n_actions=self._n_actions,
+                    states=np.array(self._states[:-1], np.int32),
+                    actions=np.array(self._actions, np.int32),
+                    rewards=np.array(self._rewards),
+                    final_state=self._states[-1],
+                    terminated=self._terminated,
+                    truncated=self._truncated,
+                    model_id=self.model_id or "",
+                    source=self.source,
+                )
+            )
+        self._forget()
+
+    def _put_model(self) -> str:
+        """Puts the environment's model into the learner; empty where it has none."""
+        inner = self.env.unwrapped
+        parts: Any
+        if isinstance(inner, MazewayEnv):
+            client = Client(inner.address, timeout=self._timeout)
+            parts = client.model_parts(inner.env_id, inner.options)
+        elif isinstance(getattr(inner, "P", None), dict):
+            client = None
+            parts = Model.from_gymnasium(self.env, self.recorded_env_id).parts()
+        else:
+            return ""
+        with contextlib.ExitStack() as stack:
+            if client is not None:
+                stack.callback(client.close)
+            learner = stack.enter_context(Learner(self.learner_address, timeout=self._timeout))
+            return learner.put_model_parts(list(parts))
+
+
+def _env_id(env: gymnasium.Env[Any, Any]) -> str:
+    if isinstance(env.unwrapped, MazewayEnv):
+        return env.unwrapped.env_id
+    if env.spec is None:
+        raise InvalidArgumentError(f"env_id: expected a name, for {env} has none of its own", field="env_id")
+    return server_env_id(env.spec.id)
+
+
+class _Uploader:
+    """Sends trajectories over one stream, and again over another where that breaks."""
+
+    def __init__(self, address: str, timeout: float) -> None:
+        self._address = address
+        self._timeout = timeout
+        #: Not acknowledged, in the order of sending; the learner knows a repeated id.
+        self.pending: dict[str, Trajectory] = {}
+        self._transport: Transport | None = None
+        self._exchange: Exchange | None = None
+        self._pid = os.getpid()
+        #: How many requests of the present stream are not answered.
+        self._in_flight = 0
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Everything but the connection, which belongs to this process."""
+        return {**self.__dict__, "_transport": None, "_exchange": None, "_in_flight": 0}
+
+    def send(self, trajectory: Trajectory) -> None:
+        """Queues and, where there is a stream, sends at once; never waits and never fails."""
+        self.pending[trajectory.trajectory_id] = trajectory
+        if self._exchange is not None and self._pid == os.getpid():
+            self._submit([trajectory])
+
+    def flush(self) -> None:
+        """Waits until nothing is pending, trying again after a failure until the timeout."""
+        deadline = time.monotonic() + self._timeout
+        while self.pending:
+            try:
+                self._attempt()
+            except (ServerUnreachableError, DeadlineExceededError):
+                self.close()
+                if time.monotonic() + _RETRY_SECS > deadline:
+                    raise
+                time.sleep(_RETRY_SECS)
+            except (InvalidArgumentError, AlreadyExistsError) as error:
+                # Refused for good: a retry would fail for ever and hold back what follows.
+                self.close()
+                refused = list(self.pending.values())
+                self.pending.clear()
+                error.refused = refused  # type: ignore[union-attr]
+                raise
+            except MazewayError:
+                self.close()
+                raise
+
+    def close(self) -> None:
+        """Drops the connection; what is pending stays."""
+        if self._pid == os.getpid():
+            if self._exchange is not None:
+                self._exchange.cancel()
+            if self._transport is not None:
+                self._transport.close()
+        self._exchange = self._transport = None
+        self._in_flight = 0
+        self._pid = os.getpid()
+
+    def _submit(self, trajectories: list[Trajectory]) -> None:
+        assert self._exchange is not None
+        messages = [trajectory.to_wire() for trajectory in trajectories]
+        self._exchange.send(_wire.learner.RecordTrajectoriesRequest(trajectories=messages))
+        self._in_flight += 1
+
+    def _attempt(self) -> None:
+        """Waits for the answers of the present stream, or opens one and sends all that is pending."""
+        if self._exchange is None or self._pid != os.getpid():
+            self.close()
+            self._transport = connect(self._address, _wire.LEARNER_SERVICE)
+            self._exchange = self._transport.exchange("RecordTrajectories", timeout=self._timeout)
+            self._submit(list(self.pending.values()))
+        while self._in_flight:
+            answer = self._exchange.receive()
+            self._in_flight -= 1
+            for trajectory_id in answer.trajectory_ids:
+                self.pending.pop(trajectory_id, None)
+        if self.pending:  # an acknowledgement that names other ids: begin anew
+            self.close()
+            raise ServerUnreachableError(
+                f"the learner at {self._address} acknowledged other trajectories than were sent"
+            )

@@ -289,7 +289,7 @@ def test_no_server_is_one_line_with_a_hint():
 
 @pytest.mark.parametrize("address", ["", "127.0.0.1", ":50051", "host:port", "host:70000", 50051])
 def test_wrong_address(address):
-    with pytest.raises(mazeway.InvalidArgumentError, match="host:port|a string"):
+    with pytest.raises(mazeway.InvalidArgumentError, match=r"host:port|a string"):
         mazeway.MazewayEnv("Maze-v0", address).reset()
 
 

@@ -31,6 +31,9 @@ _AUTORESET = _wire.env.AutoresetMode
 DEFAULT_ADDRESS = "127.0.0.1:50051"
 DEFAULT_TIMEOUT_SECS = 60.0
 
+#: Closing is a courtesy, for sessions expire: a server that does not answer must not hold it up.
+_CLOSE_TIMEOUT_SECS = 1.0
+
 
 @dataclass
 class _Connection:
@@ -46,11 +49,17 @@ class _Connection:
         """Closes the session and the connection; a child leaves its parent's alone."""
         if self.pid != os.getpid():
             return
-        if self.exchange is not None:
-            self.exchange.cancel()
+        timeout = min(self.timeout, _CLOSE_TIMEOUT_SECS)
         with contextlib.suppress(MazewayError):
-            request = _wire.env.CloseSessionRequest(session_id=self.session_id)
-            self.transport.unary("CloseSession", request, timeout=min(self.timeout, 1.0))
+            if self.exchange is not None and self.exchange.alive:
+                request = _wire.env.InteractRequest()
+                request.close.session_id = self.session_id
+                self.exchange.timeout = timeout
+                self.exchange.send(request)
+                self.exchange.receive()
+            else:
+                request = _wire.env.CloseSessionRequest(session_id=self.session_id)
+                self.transport.unary("CloseSession", request, timeout=timeout)
         self.transport.close()
 
 
@@ -223,19 +232,16 @@ class Session:
         connection = self._connection
         assert connection is not None
         with self._watched():
-            if connection.exchange is None:
+            if connection.exchange is None or not connection.exchange.alive:
                 connection.exchange = connection.transport.exchange("Interact", timeout=self.timeout)
                 getattr(request, request.WhichOneof("request")).session_id = connection.session_id
             try:
                 connection.exchange.send(request)
                 return connection.exchange.receive()
             except MazewayError:
-                # The stream is over; the session lives on and is taken up by the next stream.
-                connection.exchange = None
-                raise
+                raise  # the stream is over; the session lives on and the next stream takes it up
             except BaseException:
                 # Interrupted between request and answer: the episode's state is unknown.
-                connection.exchange = None
                 self.started = False
                 raise
 

@@ -2,7 +2,10 @@
 
 Everything above this module speaks of messages, methods and `MazewayError`s, and nothing of gRPC, so
 another transport can take this one's place (`connect` chooses). Invariants: every call ends, by an
-answer or by a `MazewayError`, within its timeout; a transport belongs to the process that made it.
+answer or by a `MazewayError`, within its timeout; a transport works on both sides of a fork.
+
+gRPC's core survives a fork only if nothing of it is at work at that moment. So every transport lets its
+channel go before a fork and connects again, in parent and child alike, with the next call.
 """
 
 from __future__ import annotations
@@ -37,9 +40,20 @@ START = {
 #: Longest message either way; a batch or a frame beyond it is refused rather than held.
 MAX_MESSAGE_BYTES = 256 * 1024 * 1024
 
+#: How long a fork waits for a call that another thread is making.
+_FORK_WAIT_SECS = 5.0
+
+#: gRPC's own threads finish with a closed channel in the background; a fork comes so long after it.
+_FORK_REST_SECS = 0.05
+
 
 class Exchange(Protocol):
     """One bidirectional stream, used in lock step: the n-th answer is to the n-th request."""
+
+    #: False once the stream is over, be it by an error, by `cancel` or by a fork.
+    alive: bool
+    #: Longest wait for an answer, in seconds.
+    timeout: float
 
     def send(self, request: Any) -> None:
         """Queues a request; never blocks."""
@@ -115,22 +129,27 @@ class GrpcTransport:
         ]
         if target.rpartition(":")[0] in ("127.0.0.1", "localhost", "[::1]"):
             options.append(("grpc.enable_http_proxy", 0))
-        self._channel = (
-            grpc.secure_channel(target, grpc.ssl_channel_credentials(), options)
-            if secure
-            else grpc.insecure_channel(target, options)
-        )
+        self._target, self._secure, self._options = target, secure, options
+        self._channel: Any = None
         self._callables: dict[str, Callable[..., Any]] = {}
+        self._exchanges: weakref.WeakSet[_GrpcExchange] = weakref.WeakSet()
+        #: Held during a call, so that no fork comes between.
+        self._lock = threading.Lock()
+        #: Calls whose messages the caller's own code makes or takes: a fork cannot wait for them.
+        self._streaming = 0
+        self._paused = False
+        _forks.add(self)
 
     def unary(self, method: str, request: Any, *, timeout: float) -> Any:
         """See `Transport`."""
-        with self._translated(timeout):
+        with self._translated(timeout), self._lock:
             return self._callable(method)(request, timeout=timeout)
 
     def responses(self, method: str, request: Any, *, timeout: float) -> Iterator[Any]:
         """See `Transport`."""
-        with self._translated(timeout):
-            call = self._callable(method)(request, timeout=timeout)
+        with self._translated(timeout), self._counted():
+            with self._lock:
+                call = self._callable(method)(request, timeout=timeout)
             try:
                 yield from call
             finally:
@@ -138,16 +157,53 @@ class GrpcTransport:
 
     def requests(self, method: str, requests: Iterable[Any], *, timeout: float) -> Any:
         """See `Transport`."""
-        with self._translated(timeout):
-            return self._callable(method)(iter(requests), timeout=timeout)
+        with self._translated(timeout), self._counted():
+            with self._lock:
+                call = self._callable(method)
+            return call(iter(requests), timeout=timeout)
 
     def exchange(self, method: str, *, timeout: float) -> Exchange:
         """See `Transport`."""
-        return _GrpcExchange(self, self._callable(method), timeout)
+        with self._lock:
+            exchange = _GrpcExchange(self, self._callable(method), timeout, self._lock)
+            self._exchanges.add(exchange)
+            return exchange
 
     def close(self) -> None:
         """See `Transport`."""
-        self._channel.close()
+        with self._lock:
+            self._disconnect()
+
+    def pause(self) -> None:
+        """Lets the channel go for a fork; calls wait for `resume`."""
+        self._paused = self._lock.acquire(timeout=_FORK_WAIT_SECS)
+        if self._paused and not self._streaming:
+            self._disconnect()
+
+    def resume(self) -> None:
+        """The fork is over."""
+        if self._paused:
+            self._paused = False
+            self._lock.release()
+
+    def _disconnect(self) -> None:
+        """Closes the channel and ends its streams; the caller holds the lock."""
+        for exchange in list(self._exchanges):
+            exchange.cancel()
+        self._exchanges.clear()
+        self._callables.clear()
+        if self._channel is not None:
+            self._channel.close()
+            self._channel = None
+            _forks.closed()
+
+    @contextlib.contextmanager
+    def _counted(self) -> Iterator[None]:
+        self._streaming += 1
+        try:
+            yield
+        finally:
+            self._streaming -= 1
 
     def translate(self, error: grpc.RpcError, timeout: float) -> MazewayError:
         """The `MazewayError` that says what `error` says."""
@@ -165,6 +221,12 @@ class GrpcTransport:
             raise ServerUnreachableError(f"the connection to {self.address} is closed ({error})") from None
 
     def _callable(self, name: str) -> Callable[..., Any]:
+        if self._channel is None:
+            self._channel = (
+                grpc.secure_channel(self._target, grpc.ssl_channel_credentials(), self._options)
+                if self._secure
+                else grpc.insecure_channel(self._target, self._options)
+            )
         if name not in self._callables:
             method = self._methods[name]
             kind = ("stream" if method.client_streaming else "unary") + (
@@ -197,9 +259,16 @@ class _GrpcExchange:
     cancels the call when an answer is late.
     """
 
-    def __init__(self, transport: GrpcTransport, method: Callable[..., Any], timeout: float) -> None:
+    def __init__(
+        self,
+        transport: GrpcTransport,
+        method: Callable[..., Any],
+        timeout: float,
+        lock: threading.Lock,
+    ) -> None:
         self._transport = transport
-        self._timeout = timeout
+        self._lock = lock
+        self.alive = True
         self._requests: SimpleQueue[Any] = SimpleQueue()
         self._call = method(iter(self._requests.get, None))
         self.timeout = timeout
@@ -211,24 +280,30 @@ class _GrpcExchange:
         self._requests.put(request)
 
     def receive(self) -> Any:
+        with self._lock:
+            return self._receive()
+
+    def _receive(self) -> Any:
         self.waiting_since = time.monotonic()
+        answer = None
         try:
-            return next(self._call)
+            answer = next(self._call)
         except StopIteration:
             raise ServerFailureError(
                 f"the server at {self._transport.address} ended the stream without an answer"
             ) from None
         except grpc.RpcError as error:
             if self.expired:
-                raise _late(self._transport.address, self._timeout) from None
-            raise self._transport.translate(error, self._timeout) from None
-        except BaseException:  # such as KeyboardInterrupt: an answer is now out of step
-            self.cancel()
-            raise
+                raise _late(self._transport.address, self.timeout) from None
+            raise self._transport.translate(error, self.timeout) from None
         finally:
             self.waiting_since = None
+            if answer is None:  # also by a KeyboardInterrupt, after which answers are out of step
+                self.cancel()
+        return answer
 
     def cancel(self) -> None:
+        self.alive = False
         self._requests.put(None)  # ends the request iterator and so grpcio's thread
         self._call.cancel()
 
@@ -274,6 +349,46 @@ class _Watchdog:
             self._wake.clear()
 
 
+class _Forks:
+    """All transports of this process, paused while it forks."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._transports: weakref.WeakSet[GrpcTransport] = weakref.WeakSet()
+        self._paused: list[GrpcTransport] = []
+        self._last_close: float | None = None
+
+    def closed(self) -> None:
+        self._last_close = time.monotonic()
+
+    def add(self, transport: GrpcTransport) -> None:
+        with self._lock:
+            self._transports.add(transport)
+
+    def before(self) -> None:
+        self._lock.acquire()
+        self._paused = list(self._transports)
+        for transport in self._paused:
+            transport.pause()
+        if self._last_close is not None:
+            time.sleep(max(0.0, self._last_close + _FORK_REST_SECS - time.monotonic()))
+
+    def after_in_parent(self) -> None:
+        for transport in self._paused:
+            transport.resume()
+        self._paused = []
+        self._lock.release()
+
+    def after_in_child(self) -> None:
+        _watchdog.forget()
+        self.after_in_parent()
+
+
 _watchdog = _Watchdog()
+_forks = _Forks()
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_watchdog.forget)
+    os.register_at_fork(
+        before=_forks.before,
+        after_in_parent=_forks.after_in_parent,
+        after_in_child=_forks.after_in_child,
+    )

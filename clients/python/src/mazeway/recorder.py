@@ -212,7 +212,7 @@ class _Uploader:
     def send(self, trajectory: Trajectory) -> None:
         """Queues and, where there is a stream, sends at once; never waits and never fails."""
         self.pending[trajectory.trajectory_id] = trajectory
-        if self._exchange is not None and self._pid == os.getpid():
+        if self._exchange is not None and self._exchange.alive and self._pid == os.getpid():
             self._submit([trajectory])
 
     def flush(self) -> None:
@@ -256,7 +256,7 @@ class _Uploader:
 
     def _attempt(self) -> None:
         """Waits for the answers of the present stream, or opens one and sends all that is pending."""
-        if self._exchange is None or self._pid != os.getpid():
+        if self._exchange is None or not self._exchange.alive or self._pid != os.getpid():
             self.close()
             self._transport = connect(self._address, _wire.LEARNER_SERVICE)
             self._exchange = self._transport.exchange("RecordTrajectories", timeout=self._timeout)

@@ -133,8 +133,9 @@ class GrpcTransport:
         self._channel: Any = None
         self._callables: dict[str, Callable[..., Any]] = {}
         self._exchanges: weakref.WeakSet[_GrpcExchange] = weakref.WeakSet()
-        #: Held during a call, so that no fork comes between.
-        self._lock = threading.Lock()
+        #: Held during a call, so that no fork comes between. Reentrant, for the garbage collector may
+        #: close a forgotten environment at any point, also while this thread holds it for a fork.
+        self._lock = threading.RLock()
         #: Calls whose messages the caller's own code makes or takes: a fork cannot wait for them.
         self._streaming = 0
         self._paused = False
@@ -264,7 +265,7 @@ class _GrpcExchange:
         transport: GrpcTransport,
         method: Callable[..., Any],
         timeout: float,
-        lock: threading.Lock,
+        lock: contextlib.AbstractContextManager[Any],
     ) -> None:
         self._transport = transport
         self._lock = lock

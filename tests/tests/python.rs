@@ -1,0 +1,153 @@
+//! The Python client, installed into virtual environments under the target directory, against the real programs:
+//! its whole suite with the newest dependencies and with the oldest that it promises to work with.
+//!
+//! Needs Python 3.10 or later with `venv` (`PYTHON` names another than `python3`) and, for the first run, a package
+//! index. An environment is made anew when the requirements change; runs that share a target directory take turns.
+
+use prost::Message as _;
+use std::{
+    env, fs,
+    fs::File,
+    path::{Path, PathBuf},
+    process::{Command, Stdio},
+    sync::OnceLock,
+    thread,
+    time::{Duration, Instant},
+};
+
+/// Longest time for one command: far beyond what it takes, for a hang must end in a message.
+const PATIENCE: Duration = Duration::from_secs(20 * 60);
+
+#[test]
+fn shipped_descriptor_set_is_current() {
+    let mut files =
+        prost_types::FileDescriptorSet::decode(mazeway_proto::FILE_DESCRIPTOR_SET).expect("a descriptor set");
+    for file in &mut files.file {
+        file.source_code_info = None;
+    }
+    let shipped = fs::read(package().join("src/mazeway/_wire/mazeway.desc")).expect("the shipped descriptor set");
+    assert!(
+        files.encode_to_vec() == shipped,
+        "the Python package ships an outdated descriptor set: cargo run -p mazeway-proto --example write_descriptors"
+    );
+}
+
+#[test]
+fn suite_passes_with_the_newest_dependencies() {
+    let python = Venv::new("newest", None);
+    python.run("ruff", &["check", "."]);
+    python.run("ruff", &["format", "--check", "."]);
+    let said = python.run("pytest", &["-p", "no:cacheprovider"]);
+    assert!(!said.contains(" skipped"), "tests were skipped:\n{said}");
+}
+
+#[test]
+fn suite_passes_with_the_oldest_dependencies() {
+    let python = Venv::new("oldest", Some("tests/constraints-oldest.txt"));
+    let said = python.run("pytest", &["-p", "no:cacheprovider"]);
+    let unexpected = said.lines().find(|line| line.starts_with("SKIPPED") && !line.contains("Gymnasium 1.0"));
+    assert!(unexpected.is_none(), "tests were skipped without a reason to:\n{said}");
+}
+
+/// Directory of the Python package.
+fn package() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../clients/python").canonicalize().expect("clients/python")
+}
+
+/// A virtual environment that holds the package and what its tests need, ours alone while this lives.
+struct Venv {
+    directory: PathBuf,
+    _lock: File,
+}
+
+impl Venv {
+    fn new(name: &str, constraints: Option<&str>) -> Self {
+        let home = Path::new(env!("CARGO_TARGET_TMPDIR")).join("python");
+        fs::create_dir_all(&home).expect("a directory for virtual environments");
+        let lock = File::create(home.join(format!("{name}.lock"))).expect("a lock file");
+        lock.lock().expect("a lock");
+        let venv = Self { directory: home.join(name), _lock: lock };
+
+        let interpreter = env::var("PYTHON").unwrap_or_else(|_| "python3".into());
+        let version = "import sys; assert sys.version_info >= (3, 10), sys.version; print(sys.version, sys.executable)";
+        let version = finish(Command::new(&interpreter).args(["-c", version]), &home.join("version.log"));
+        let project = fs::read_to_string(package().join("pyproject.toml")).expect("pyproject.toml");
+        let pins = constraints.map(|path| fs::read_to_string(package().join(path)).expect("constraints"));
+        let wanted = format!("{version}{project}{}", pins.unwrap_or_default());
+        let stamp = venv.directory.join("requirements");
+        if fs::read_to_string(&stamp).ok().as_ref() != Some(&wanted) {
+            if venv.directory.exists() {
+                fs::remove_dir_all(&venv.directory).expect("an outdated environment that can be removed");
+            }
+            let directory = venv.directory.to_str().expect("a path in UTF-8").to_owned();
+            finish(Command::new(&interpreter).args(["-m", "venv", &directory]), &home.join(format!("{name}.log")));
+            let mut arguments = vec!["install", "--quiet", ".[test]"];
+            if let Some(path) = constraints {
+                arguments.extend(["--constraint", path]);
+            }
+            venv.run("pip", &arguments);
+            fs::write(stamp, wanted).expect("a stamp");
+        }
+        // The package itself is installed anew each time: a wheel, as users get it.
+        venv.run("pip", &["install", "--quiet", "--no-deps", "--force-reinstall", "--no-build-isolation", "."]);
+        venv
+    }
+
+    /// Runs a module of the environment in the package's directory, with the real programs at hand; returns what it
+    /// said. Panics with that where it fails.
+    fn run(&self, module: &str, arguments: &[&str]) -> String {
+        let scripts = self.directory.join(if cfg!(windows) { "Scripts" } else { "bin" });
+        let mut command = Command::new(scripts.join("python"));
+        command.arg("-m").arg(module).args(arguments).current_dir(package());
+        command.env("MAZEWAY_BIN_DIR", programs()).env("PYTHONDONTWRITEBYTECODE", "1");
+        command.env("PIP_DISABLE_PIP_VERSION_CHECK", "1").env("RUFF_NO_CACHE", "true");
+        finish(&mut command, &self.directory.with_extension("log"))
+    }
+}
+
+/// Runs a command with its output in a file; returns that output. Panics with it where the command fails or hangs.
+fn finish(command: &mut Command, log: &Path) -> String {
+    let output = File::create(log).expect("a log file");
+    let errors = output.try_clone().expect("a log file");
+    let spawned = command.stdin(Stdio::null()).stdout(output).stderr(errors).spawn();
+    let mut child = spawned.unwrap_or_else(|error| panic!("{command:?}: {error}"));
+    let began = Instant::now();
+    let status = loop {
+        if let Some(status) = child.try_wait().expect("a child to wait for") {
+            break Some(status);
+        }
+        if began.elapsed() > PATIENCE {
+            child.kill().expect("a child to kill");
+            child.wait().expect("a child to wait for");
+            break None;
+        }
+        thread::sleep(Duration::from_millis(50));
+    };
+    let said = String::from_utf8_lossy(&fs::read(log).expect("a log file")).into_owned();
+    match status {
+        Some(status) => assert!(status.success(), "{command:?}: {status}\n{said}"),
+        None => panic!("{command:?}: no end after {PATIENCE:?}\n{said}"),
+    }
+    said
+}
+
+/// Directory of the programs `server` and `learner`, built from the present sources in this test's own profile.
+fn programs() -> &'static Path {
+    static DIRECTORY: OnceLock<PathBuf> = OnceLock::new();
+    DIRECTORY.get_or_init(|| {
+        let own = env::current_exe().expect("a path of this test");
+        let profile = own.ancestors().nth(2).and_then(Path::file_name).expect("a profile's directory");
+        let profile = if profile == "debug" { "dev" } else { profile.to_str().expect("a name in UTF-8") };
+        let mut cargo = Command::new(env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
+        cargo.args(["build", "--quiet", "--workspace", "--bin", "server", "--bin", "learner", "--profile", profile]);
+        cargo.args(["--message-format", "json-render-diagnostics"]).current_dir(env!("CARGO_MANIFEST_DIR"));
+        let output = cargo.stderr(Stdio::inherit()).output().expect("cargo");
+        assert!(output.status.success(), "{cargo:?}: {}", output.status);
+        String::from_utf8_lossy(&output.stdout)
+            .lines()
+            .filter_map(|line| serde_json::from_str::<serde_json::Value>(line).ok())
+            .filter_map(|message| Some(PathBuf::from(message.get("executable")?.as_str()?)))
+            .find_map(|program| Some(program.parent()?.to_path_buf()))
+            .expect("the path of a program")
+    })
+}

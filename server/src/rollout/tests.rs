@@ -1,1 +1,181 @@
+use super::*;
+use crate::{
+    batch::{Autoreset, Batch, BatchOptions, Seeds, SimBatch},
+    sim::maze,
+};
+use proptest::prelude::*;
+use std::sync::atomic::{AtomicU32, Ordering};
 
+fn maze() -> Configured<maze::Maze> {
+    maze::configure(&serde_json::Map::new()).unwrap()
+}
+
+fn uniform_policy() -> Controller {
+    Controller::Policy(TabularPolicy::new(&[0.25; 57 * 4], 57, 4).unwrap())
+}
+
+fn plan(controller: Controller) -> RolloutPlan {
+    RolloutPlan {
+        controller,
+        seed: 40,
+        episodes: 23,
+        steps: 17,
+        burn_in_steps: 0,
+        totals_only: false,
+        chunk_episodes: 8,
+    }
+}
+
+fn run(plan: &RolloutPlan) -> EpisodeChunk {
+    let mut all: Option<EpisodeChunk> = None;
+    plan.check(&maze().spec).unwrap();
+    roll_out(&maze(), plan, &|| false, &mut |chunk| {
+        assert!(chunk.lengths.len() <= plan.chunk_episodes as usize);
+        match &mut all {
+            None => all = Some(chunk),
+            Some(all) => {
+                assert_eq!(chunk.first_episode as usize, all.lengths.len());
+                all.lengths.extend(chunk.lengths);
+                all.states.extend(chunk.states);
+                all.actions.extend(chunk.actions);
+                all.rewards.extend(chunk.rewards);
+                all.final_states.extend(chunk.final_states);
+                all.terminated.extend(chunk.terminated);
+                all.returns.extend(chunk.returns);
+            }
+        }
+        true
+    });
+    all.unwrap()
+}
+
+#[test]
+fn threads_and_chunks_change_nothing() {
+    for controller in [uniform_policy(), Controller::Driver("random".into()), Controller::Driver("optimal".into())] {
+        let reference = run(&plan(controller.clone()));
+        assert_eq!(reference.lengths, [17; 23]);
+        for threads in [1, 2, 5] {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            assert_eq!(pool.install(|| run(&plan(controller.clone()))), reference);
+        }
+        for chunk_episodes in [1, 5, 100] {
+            assert_eq!(run(&RolloutPlan { chunk_episodes, ..plan(controller.clone()) }), reference);
+        }
+    }
+}
+
+#[test]
+fn episode_i_is_seeded_with_seed_plus_i() {
+    let all = run(&plan(uniform_policy()));
+    let later = run(&RolloutPlan { seed: 45, episodes: 1, ..plan(uniform_policy()) });
+    assert_eq!(later.states, all.states[5 * 17..6 * 17]);
+    assert_eq!(later.actions, all.actions[5 * 17..6 * 17]);
+}
+
+#[test]
+fn a_session_that_repeats_the_actions_sees_the_same_episode() {
+    let all = run(&plan(Controller::Driver("random".into())));
+    let options =
+        BatchOptions { num_envs: 23, autoreset: Autoreset::Disabled, max_episode_steps: 0, action_masks: false };
+    let mut batch = SimBatch::new(&maze(), options);
+    batch.reset(Seeds::From(40), None).unwrap();
+    for step in 0..17 {
+        let at = |episode: usize| episode * 17 + step;
+        for episode in 0..23 {
+            assert_eq!(batch.tabular_state(episode), Ok(all.states[at(episode)]));
+        }
+        let actions: Vec<u8> = (0..23).flat_map(|episode| (all.actions[at(episode)] as i32).to_le_bytes()).collect();
+        let buffers = batch.step(&actions).unwrap();
+        for episode in 0..23 {
+            assert_eq!(buffers.reward(episode), all.rewards[at(episode)]);
+        }
+    }
+    for episode in 0..23 {
+        assert_eq!(batch.tabular_state(episode), Ok(all.final_states[episode]));
+    }
+}
+
+#[test]
+fn burn_in_is_the_head_of_a_longer_episode() {
+    let whole = run(&plan(uniform_policy()));
+    let tail = run(&RolloutPlan { burn_in_steps: 5, steps: 12, ..plan(uniform_policy()) });
+    for episode in 0..23 {
+        assert_eq!(tail.states[episode * 12..][..12], whole.states[episode * 17 + 5..][..12]);
+    }
+    assert_eq!(tail.final_states, whole.final_states);
+}
+
+#[test]
+fn totals_alone_are_the_same_totals() {
+    let (whole, totals) =
+        (run(&plan(uniform_policy())), run(&RolloutPlan { totals_only: true, ..plan(uniform_policy()) }));
+    assert!(totals.states.is_empty() && totals.actions.is_empty() && totals.rewards.is_empty());
+    assert_eq!(
+        (totals.returns, totals.lengths, totals.final_states),
+        (whole.returns, whole.lengths, whole.final_states)
+    );
+}
+
+#[test]
+fn it_stops_when_nobody_listens() {
+    let mut chunks = 0;
+    roll_out(&maze(), &plan(uniform_policy()), &|| false, &mut |_| {
+        chunks += 1;
+        false
+    });
+    assert_eq!(chunks, 1);
+    // A single endless episode asks now and then.
+    let asked = AtomicU32::new(0);
+    let endless = RolloutPlan { steps: u32::MAX, totals_only: true, episodes: 1, ..plan(uniform_policy()) };
+    let cancelled = || asked.fetch_add(1, Ordering::Relaxed) > 2;
+    roll_out(&maze(), &endless, &cancelled, &mut |_| panic!("it was cancelled"));
+}
+
+#[test]
+fn wrong_plans_name_their_field() {
+    let spec = maze().spec;
+    let field = |plan: RolloutPlan| plan.check(&spec).unwrap_err().field();
+    assert_eq!(field(RolloutPlan { episodes: 0, ..plan(uniform_policy()) }), "episodes");
+    assert_eq!(field(RolloutPlan { steps: 0, ..plan(uniform_policy()) }), "steps");
+    let unknown = plan(Controller::Driver("kamikaze".into())).check(&spec).unwrap_err();
+    assert_eq!(unknown.field(), "driver");
+    assert_eq!(unknown.to_string(), "expected a driver among optimal, random, got \"kamikaze\"");
+    let small = TabularPolicy::new(&[1.0], 1, 1).unwrap();
+    assert_eq!(field(plan(Controller::Policy(small))), "policy.probabilities");
+    let policy = |values: &[f64]| TabularPolicy::new(values, 2, 2).unwrap_err().field();
+    assert_eq!(policy(&[1.0, 0.0, 0.5]), "policy.probabilities");
+    assert_eq!(policy(&[1.0, 0.0, 1.5, -0.5]), "policy.probabilities[1][1]");
+    assert_eq!(policy(&[f64::NAN, 0.0, 0.5, 0.5]), "policy.probabilities[0][0]");
+    assert_eq!(policy(&[1.0, 0.0, 0.5, 0.49]), "policy.probabilities[1]");
+}
+
+proptest! {
+    #[test]
+    fn drawn_actions_have_positive_probability(
+        weights in prop::collection::vec(prop_oneof![Just(0.0), 0.01..1.0_f64], 1..8), seed in any::<u64>(),
+    ) {
+        let total: f64 = weights.iter().sum();
+        prop_assume!(total > 0.0);
+        let row: Vec<f64> = weights.iter().map(|weight| weight / total).collect();
+        let policy = TabularPolicy::new(&row, 1, row.len() as u32).unwrap();
+        let mut rng = stream(seed, Purpose::Controller);
+        for _ in 0..200 {
+            prop_assert!(row[policy.draw(0, &mut rng) as usize] > 0.0);
+        }
+    }
+}
+
+#[test]
+fn actions_are_drawn_as_often_as_they_are_probable() {
+    let row = [0.1, 0.0, 0.6, 0.3];
+    let policy = TabularPolicy::new(&row, 1, 4).unwrap();
+    let mut rng = stream(1, Purpose::Controller);
+    let mut counts = [0_u32; 4];
+    for _ in 0..100_000 {
+        counts[policy.draw(0, &mut rng) as usize] += 1;
+    }
+    for (count, probability) in counts.into_iter().zip(row) {
+        // Four standard deviations are below 0.0063.
+        assert!((f64::from(count) / 1e5 - probability).abs() < 0.0063, "{counts:?}");
+    }
+}

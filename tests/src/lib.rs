@@ -1,5 +1,8 @@
 //! What Mazeway's end-to-end tests share: real servers on free ports of the loopback interface, shut down on drop.
 
+pub mod faces;
+pub mod proxy;
+
 use mazeway_server::Config;
 use std::{net::SocketAddr, thread::JoinHandle, time::Duration};
 use tokio::sync::oneshot;

@@ -64,6 +64,14 @@ impl Observations {
         }
     }
 
+    /// All of them as they travelled.
+    pub fn as_bytes(&self) -> &Bytes {
+        match self {
+            Self::Discrete(values) => values.as_bytes(),
+            Self::Box { values, .. } => values.as_bytes(),
+        }
+    }
+
     /// The integers, where the space is discrete, shape `(num_envs,)`.
     pub fn discrete(&self) -> Option<&Packed<u32>> {
         match self {
@@ -113,6 +121,11 @@ impl Infos {
     fn typed<T: Element>(&self, name: &str, dtype: DType) -> Option<Packed<T>> {
         let (column, bytes) = self.column(name)?;
         if column.dtype == dtype { Packed::new(bytes.clone()) } else { None }
+    }
+
+    /// A column of any type as it travelled.
+    pub fn as_bytes(&self, name: &str) -> Option<&Bytes> {
+        self.column(name).map(|(_, bytes)| bytes)
     }
 
     /// An `Int32` column, shape `(num_envs, ...)`; `None` for another name or type.

@@ -7,6 +7,11 @@ use mazeway_server::Config;
 use std::{net::SocketAddr, thread::JoinHandle, time::Duration};
 use tokio::sync::oneshot;
 
+/// Default limits, but calls that still run at the end of a test are cut off soon: its clients no longer answer by then.
+pub fn config() -> Config {
+    Config { shutdown_grace: Duration::from_millis(100), ..Config::default() }
+}
+
 /// A real environment server on a thread and a runtime of its own, so that tests with and without a runtime use it alike.
 #[derive(Debug)]
 pub struct EnvServer {
@@ -18,7 +23,7 @@ pub struct EnvServer {
 impl EnvServer {
     /// Starts a server with default limits.
     pub fn start() -> Self {
-        Self::with(Config { shutdown_grace: Duration::from_millis(200), ..Config::default() })
+        Self::with(config())
     }
 
     /// Starts a server.

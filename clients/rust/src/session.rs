@@ -15,8 +15,8 @@ use tonic::{Code, Streaming};
 
 /// Requests that may be on their way before their answers are read.
 const PIPELINE: usize = 64;
-/// Longest time that a session is tried to be taken up again, within its lease.
-const RESUME: Duration = Duration::from_secs(30);
+/// How long a session is tried to be taken up again, unless asked otherwise.
+const RESUME: Duration = Duration::from_secs(10);
 
 /// What happens to an environment whose episode has ended (Gymnasium 1.x).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -41,6 +41,8 @@ pub struct SessionOptions {
     pub lease: Option<Duration>,
     /// Append the info column `action_mask`.
     pub action_masks: bool,
+    /// How long a call tries to take the session up again where the connection is broken, at most the lease; `None`: 10 s.
+    pub resume_within: Option<Duration>,
 }
 
 /// How to draw.
@@ -77,7 +79,7 @@ pub(crate) struct Session {
     pub spec: EnvSpec,
     pub num_envs: usize,
     pub max_episode_steps: u32,
-    lease: Duration,
+    resume_within: Duration,
     open: Option<Open>,
     closed: bool,
 }
@@ -139,7 +141,7 @@ impl Session {
             spec: EnvSpec::from_wire(spec)?,
             num_envs: answer.num_envs as usize,
             max_episode_steps: answer.max_episode_steps,
-            lease,
+            resume_within: options.resume_within.unwrap_or(RESUME).min(lease),
             open: None,
             closed: false,
         })
@@ -222,7 +224,7 @@ impl Session {
     /// Sends a request and waits for its answer; takes the session up again where the connection broke before.
     pub async fn call(&mut self, request: Request) -> Result<Response, ClientError> {
         self.settle().await;
-        let give_up = Instant::now() + self.lease.min(RESUME);
+        let give_up = Instant::now() + self.resume_within;
         let mut pause = Duration::from_millis(5);
         loop {
             let error = match self.try_call(&request).await {

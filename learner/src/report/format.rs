@@ -1,10 +1,36 @@
 //! Numbers and names as people read them. A number that is not finite reads `–`.
 
-use super::{Interval, Report};
+use super::{DriverMetrics, Interval, Report};
 use crate::irl::Stopped;
 
 /// What stands for a missing number.
 pub(crate) const MISSING: &str = "–";
+
+/// One of the numbers that drivers are compared by.
+pub(crate) struct Metric {
+    /// Heading of its column.
+    pub(crate) name: &'static str,
+    /// Where it stands.
+    pub(crate) of: fn(&DriverMetrics) -> &Interval,
+    /// Whether it counts events a step, and so starts at zero.
+    pub(crate) rate: bool,
+}
+
+impl Metric {
+    /// Decimals with which all drivers' numbers are written: as many as the narrowest interval needs.
+    pub(crate) fn decimals(&self, drivers: &[&DriverMetrics]) -> usize {
+        let (least, most) = if self.rate { (3, 5) } else { (2, 3) };
+        decimals(drivers.iter().map(|&driver| (self.of)(driver)), least, most)
+    }
+}
+
+/// The columns of the drivers' table.
+pub(crate) const METRICS: [Metric; 4] = [
+    Metric { name: "mean speed, m/s", of: |m| &m.speed_mps, rate: false },
+    Metric { name: "collisions a step", of: |m| &m.collisions, rate: true },
+    Metric { name: "overtakes left, a step", of: |m| &m.overtakes_left, rate: true },
+    Metric { name: "overtakes right, a step", of: |m| &m.overtakes_right, rate: true },
+];
 
 /// A number with a fixed count of decimals.
 pub(crate) fn fixed(value: f64, decimals: usize) -> String {
@@ -38,6 +64,16 @@ pub(crate) fn alike(column: impl IntoIterator<Item = f64>) -> impl Fn(f64) -> St
     let most = column.into_iter().filter(|x| x.is_finite()).fold(0.0, |most: f64, x| most.max(x.abs()));
     let decimals = if most > 0.0 { 2 - most.log10().floor() as i32 } else { 2 };
     move |value| if (0..=6).contains(&decimals) { fixed(value, decimals as usize) } else { brief(value) }
+}
+
+/// A power of ten in which numbers are short to write, and how to say so; 1 and nothing where they are so already.
+pub(crate) fn unit(values: &[f64]) -> (f64, String) {
+    let most = values.iter().filter(|x| x.is_finite()).fold(0.0, |most: f64, x| most.max(x.abs()));
+    if most == 0.0 || (1e-2..1e4).contains(&most) {
+        return (1.0, String::new());
+    }
+    let power = 3 * (most.log10() / 3.0).floor() as i32;
+    (10f64.powi(power), format!(", in 1e{power}").replace('-', "−"))
 }
 
 /// A count with thousands apart.
@@ -81,7 +117,7 @@ pub(crate) fn duration(secs: f64) -> String {
 }
 
 /// Decimals at which the narrowest interval of a column still shows its width.
-pub(crate) fn decimals<'a>(column: impl IntoIterator<Item = &'a Interval>, least: usize, most: usize) -> usize {
+fn decimals<'a>(column: impl IntoIterator<Item = &'a Interval>, least: usize, most: usize) -> usize {
     column
         .into_iter()
         .map(|interval| (interval.high - interval.low) / 2.0)

@@ -3,7 +3,7 @@
 //! Pictures lie in the page as SVG, frames as data URIs. There is no script. Whatever came from a user is escaped: text by
 //! the template, text in pictures by whoever drew them.
 
-use super::format::{MISSING, alike, clip, count, decimals, duration, interval_parts, options, percent, stopped};
+use super::format::{METRICS, MISSING, alike, clip, count, duration, interval_parts, options, percent, stopped};
 use super::pictures::{self, Picture};
 use super::space::{LANES, SPEEDS_MPS, TRAFFIC};
 use super::table::{highway_choice, summary_rows};
@@ -151,19 +151,13 @@ fn drivers(report: &Report) -> Option<Value> {
     let rows =
         [("expert", drivers.expert.as_ref()), ("learned", Some(&drivers.learned)), ("random", Some(&drivers.random))];
     let known: Vec<&DriverMetrics> = rows.iter().filter_map(|row| row.1).collect();
-    let columns: [(&str, fn(&DriverMetrics) -> &Interval, usize, usize); 4] = [
-        ("mean speed, m/s", |m| &m.speed_mps, 2, 3),
-        ("collisions a step", |m| &m.collisions, 3, 5),
-        ("overtakes on the left, a step", |m| &m.overtakes_left, 3, 5),
-        ("overtakes on the right, a step", |m| &m.overtakes_right, 3, 5),
-    ];
-    let scales = columns.map(|(_, value, least, most)| {
-        let column: Vec<&Interval> = known.iter().map(|&metrics| value(metrics)).collect();
-        let ends = column.iter().flat_map(|i| [i.low, i.mean, i.high]).filter(|x| x.is_finite());
+    let scales = METRICS.each_ref().map(|metric| {
+        let ends = known.iter().map(|&driver| (metric.of)(driver)).flat_map(|i| [i.low, i.mean, i.high]);
+        let ends = ends.filter(|x| x.is_finite());
         let (low, high) = ends.fold((f64::INFINITY, 0.0f64), |(low, high), x| (low.min(x), high.max(x)));
         // Rates are drawn from zero; speeds are not: what matters there is how they differ.
-        let low = if least == 3 { low.min(0.0) } else { (low - 0.15 * (high - low)).floor() };
-        (decimals(column, least, most), low, if high > low { high } else { low + 1.0 })
+        let low = if metric.rate { low.min(0.0) } else { (low - 0.15 * (high - low)).floor() };
+        (metric.decimals(&known), low, if high > low { high } else { low + 1.0 })
     });
     let cell = |value: &Interval, (places, low, high): (usize, f64, f64)| {
         let (mean, spread) = interval_parts(value, places);
@@ -171,15 +165,15 @@ fn drivers(report: &Report) -> Option<Value> {
         let (left, right) = (at(value.low), at(value.high));
         let text = |x: f64| format!("{x:.2}");
         let bar = value.low.is_finite() && value.high.is_finite();
-        context! { mean => mean, spread => spread, bar => bar, left => text(left), width => text(right - left), at => text(at(value.mean)) }
+        context! { mean => mean, spread => spread, dot => value.mean.is_finite(), bar => bar, left => text(left), width => text(right - left), at => text(at(value.mean)) }
     };
     let rows: Vec<Value> = rows
         .iter()
         .map(|&(name, metrics)| {
-            let cells: Vec<Value> = columns
+            let cells: Vec<Value> = METRICS
                 .iter()
                 .zip(scales)
-                .map(|(column, scale)| metrics.map_or_else(|| context! { mean => "" }, |m| cell(column.1(m), scale)))
+                .map(|(metric, scale)| metrics.map_or_else(|| context! { mean => "" }, |m| cell((metric.of)(m), scale)))
                 .collect();
             context! { name => name, cells => cells }
         })
@@ -188,7 +182,7 @@ fn drivers(report: &Report) -> Option<Value> {
         let (episodes, steps) = (count(evaluation.episodes as f64), count(evaluation.steps as f64));
         format!("{episodes} roll-outs of {steps} steps each.")
     });
-    Some(context! { note => note, columns => columns.map(|column| column.0).to_vec(), rows => rows })
+    Some(context! { note => note, columns => METRICS.each_ref().map(|metric| metric.name).to_vec(), rows => rows })
 }
 
 /// Figures in groups, each with a heading.

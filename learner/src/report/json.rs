@@ -22,10 +22,8 @@ struct Summary<'a> {
     method: &'a str,
     trajectories: u64,
     horizon: u32,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    drivers: Option<Option<DriversJson>>,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    expected_value_difference: Option<Finite>,
+    #[serde(flatten)]
+    evaluation: Evaluation,
     agreement: Finite,
     states_covered: u32,
     stopped: crate::irl::Stopped,
@@ -44,8 +42,11 @@ impl<'a> Summary<'a> {
             method: &report.method,
             trajectories: report.trajectories,
             horizon: report.horizon,
-            drivers: driven.then(|| report.drivers.map(DriversJson::from)),
-            expected_value_difference: (!driven).then(|| Finite(report.expected_value_difference.unwrap_or(f64::NAN))),
+            evaluation: if driven {
+                Evaluation::Drivers(report.drivers.map(|drivers| Box::new(drivers.into())))
+            } else {
+                Evaluation::ExpectedValueDifference(Finite(report.expected_value_difference.unwrap_or(f64::NAN)))
+            },
             agreement: Finite(report.agreement),
             states_covered: report.states_covered,
             stopped: report.stopped,
@@ -55,6 +56,14 @@ impl<'a> Summary<'a> {
             report: path.map(|path| path.display().to_string()),
         }
     }
+}
+
+/// How well the policy does: one key or the other.
+#[derive(Serialize)]
+#[serde(rename_all = "snake_case")]
+enum Evaluation {
+    Drivers(Option<Box<DriversJson>>),
+    ExpectedValueDifference(Finite),
 }
 
 #[derive(Serialize)]

@@ -83,7 +83,7 @@ pub struct GridLayout {
     pub rows: u32,
     /// Number of columns.
     pub columns: u32,
-    /// Row-major cell (row * columns + column) of each state, shape (n_states,).
+    /// Row-major cell (row * columns + column) of each state, shape (S,).
     pub cells: Vec<u32>,
 }
 

@@ -111,7 +111,8 @@ impl Report {
         row.iter().copied().enumerate().filter(|&(_, p)| p >= 0.5 * most).collect()
     }
 
-    /// Reward of what the greedy policy does in a state: Σ_a π(a|s) R(s,a).
+    /// Reward of what the greedy policy does in a state: the mean of R(s,a) under π(a|s); not a number
+    /// where it does nothing.
     pub(crate) fn greedy_reward(&self, state: usize) -> f64 {
         mean_reward(&self.reward, &self.greedy_policy, state, self.actions())
     }
@@ -150,5 +151,6 @@ impl Report {
 
 fn mean_reward(reward: &[f64], policy: &[f64], state: usize, n_actions: usize) -> f64 {
     let row = state * n_actions..(state + 1) * n_actions;
-    reward[row.clone()].iter().zip(&policy[row]).filter(|&(_, &p)| p > 0.0).map(|(r, p)| r * p).sum()
+    let taken = || reward[row.clone()].iter().zip(&policy[row.clone()]).filter(|&(_, &p)| p > 0.0);
+    if taken().next().is_none() { f64::NAN } else { taken().map(|(r, p)| r * p).sum() }
 }

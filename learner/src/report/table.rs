@@ -2,10 +2,11 @@
 //!
 //! Invariants: no line is wider than the terminal where a table can be made narrow enough, and no escape code is written unless colours are wanted.
 
-use super::format::{MISSING, alike, brief, clip, count, decimals, duration, fixed, interval, percent, stopped};
+use super::format::{METRICS, MISSING, alike, brief, clip, count, duration, fixed, interval, percent, stopped};
 use super::space::{Heading, LANES, LaneChange, SPEEDS_MPS, TRAFFIC, highway_action, highway_state};
-use super::{DriverMetrics, Interval, Report, ReportError};
+use super::{DriverMetrics, Report, ReportError};
 use comfy_table::{Cell, CellAlignment, Color, ContentArrangement, LineStyle, Table, TableStyle};
+use std::fmt::Write as _;
 use std::io::IsTerminal;
 
 /// States listed where the environment has no layout that is known here.
@@ -102,19 +103,13 @@ fn drivers(report: &Report, terminal: Terminal) -> Option<String> {
     let rows =
         [("expert", drivers.expert.as_ref()), ("learned", Some(&drivers.learned)), ("random", Some(&drivers.random))];
     let known: Vec<&DriverMetrics> = rows.iter().filter_map(|&(_, metrics)| metrics).collect();
-    let columns: [(&str, fn(&DriverMetrics) -> &Interval, usize, usize); 4] = [
-        ("mean speed m/s", |m| &m.speed_mps, 2, 3),
-        ("collisions a step", |m| &m.collisions, 3, 5),
-        ("overtakes left a step", |m| &m.overtakes_left, 3, 5),
-        ("overtakes right a step", |m| &m.overtakes_right, 3, 5),
-    ];
     let mut table = terminal.table();
-    table.set_header(std::iter::once(head("driver")).chain(columns.iter().map(|column| head(column.0))));
+    table.set_header(std::iter::once(head("driver")).chain(METRICS.iter().map(|metric| head(metric.name))));
     for (name, metrics) in rows {
         let mut cells = vec![Cell::new(name)];
-        for (_, value, least, most) in columns {
-            let places = decimals(known.iter().map(|&m| value(m)), least, most);
-            cells.push(Cell::new(metrics.map_or_else(|| MISSING.to_owned(), |m| interval(value(m), places))));
+        for metric in &METRICS {
+            let places = metric.decimals(&known);
+            cells.push(Cell::new(metrics.map_or_else(|| MISSING.to_owned(), |m| interval((metric.of)(m), places))));
         }
         if name == "learned" {
             cells = cells.into_iter().map(|cell| cell.fg(Color::Cyan)).collect();
@@ -181,7 +176,7 @@ fn summary(report: &Report, terminal: Terminal) -> String {
     let mut text =
         format!("{}  {}", terminal.heading("Fit"), terminal.dim(&clip(&what, terminal.width.saturating_sub(5))));
     for (name, value) in rows {
-        text += &format!("\n  {} {value}", terminal.dim(&format!("{name:width$}")));
+        let _ = write!(text, "\n  {} {value}", terminal.dim(&format!("{name:width$}")));
     }
     text
 }
@@ -318,9 +313,9 @@ fn grid(report: &Report, headings: &[Heading], terminal: Terminal) -> String {
         text += "    optimal";
     }
     for row in 0..rows {
-        text += &format!("\n  {}", draw(&report.greedy_policy, row));
+        let _ = write!(text, "\n  {}", draw(&report.greedy_policy, row));
         if let Some(policy) = beside {
-            text += &format!("{:gap$}{}", "", draw(policy, row));
+            let _ = write!(text, "{:gap$}{}", "", draw(policy, row));
         }
     }
     text.lines().map(str::trim_end).collect::<Vec<_>>().join("\n")

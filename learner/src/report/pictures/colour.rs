@@ -1,6 +1,6 @@
 //! Colours: one scale for sizes, one for values of either sign, and the few hues of the design.
 //!
-//! Both scales fall evenly in lightness (OKLab), so that they read alike in grey and to colour-blind eyes.
+//! Both scales fall evenly in lightness (as the eye sees it), so that they read alike in grey and to colour-blind eyes.
 
 use plotters::style::RGBColor;
 
@@ -23,7 +23,7 @@ pub(super) const EMPTY: RGBColor = RGBColor(0xf3, 0xf5, 0xf8);
 /// Paper, and text on dark ground.
 pub(super) const PAPER: RGBColor = RGBColor(0xff, 0xff, 0xff);
 
-/// Light yellow over green to dark blue; OKLab lightness 0.975 to 0.32 in even steps.
+/// Light yellow over green to dark blue; perceived lightness 0.975 to 0.32 in even steps.
 const RISING: [RGBColor; 9] = [
     RGBColor(246, 249, 229),
     RGBColor(200, 229, 197),
@@ -36,7 +36,7 @@ const RISING: [RGBColor; 9] = [
     RGBColor(36, 40, 110),
 ];
 
-/// Brown over white to blue; OKLab lightness 0.5 to 0.975 and back in even steps.
+/// Brown over white to blue; perceived lightness 0.5 to 0.975 and back in even steps.
 const EITHER_SIGN: [RGBColor; 9] = [
     RGBColor(159, 68, 15),
     RGBColor(183, 115, 74),
@@ -73,6 +73,11 @@ impl Scale {
     pub(super) fn over(values: impl IntoIterator<Item = f64>) -> Self {
         let (low, high) = extent(values);
         if high > low { Self { low, high, stops: &RISING } } else { Self { low, high: low + 1.0, stops: &RISING } }
+    }
+
+    /// The same scale for values in another unit.
+    pub(super) fn divided(self, unit: f64) -> Self {
+        Self { low: self.low / unit, high: self.high / unit, ..self }
     }
 
     /// Where a value lies between the ends, in [0, 1]; `None` for no number.

@@ -4,9 +4,10 @@ use super::canvas::{Canvas, Type, fit, text_width};
 use super::colour::{ACCENT, EMPTY, MUTED, RULE, Scale};
 use super::panel::{BAR, MARGIN, TITLE, WIDTH, bar, title};
 use super::{Part, Picture};
-use crate::report::format::{alike, count};
+use crate::report::format::{alike, count, unit};
 use crate::report::{Report, ReportError};
 use plotters::style::Color;
+use std::fmt::Write as _;
 
 /// States and actions drawn at most.
 const MOST_STATES: usize = 60;
@@ -19,7 +20,6 @@ const SET: f64 = 10.5;
 struct Layout {
     states: Vec<usize>,
     actions: Vec<usize>,
-    all: bool,
     row: f64,
     column: f64,
     /// Height of the actions' names.
@@ -30,7 +30,7 @@ struct Layout {
 
 impl Layout {
     fn new(report: &Report) -> Self {
-        let (states, all_states) = report.leading_states(MOST_STATES);
+        let (states, _) = report.leading_states(MOST_STATES);
         let mut actions: Vec<usize> = (0..report.actions()).collect();
         // Actions that the policy takes most often come first where not all have room.
         let weight =
@@ -40,39 +40,36 @@ impl Layout {
             actions.truncate(MOST_ACTIONS);
             actions.sort_unstable();
         }
-        let all = all_states && actions.len() == report.actions();
         let longest = states.iter().map(|&s| text_width(&report.state_name(s, 60), SET)).fold(40.0, f64::max);
         let left = MARGIN + (longest + 10.0).min(STATE_NAMES);
         let column = ((WIDTH - MARGIN - left) / actions.len().max(1) as f64).min(80.0);
         let row = if states.len() > 20 { 15.0 } else { 22.0 };
         let longest = actions.iter().map(|&a| text_width(&report.action_name(a, 22), SET)).fold(0.0, f64::max);
-        Self {
-            states,
-            actions,
-            all,
-            row,
-            column,
-            left,
-            names: if longest < column - 4.0 { 20.0 } else { longest + 12.0 },
-        }
+        Self { states, actions, row, column, left, names: if longest < column - 4.0 { 20.0 } else { longest + 12.0 } }
     }
 
     fn height(&self) -> f64 {
         self.row * self.states.len() as f64
     }
 
-    fn note(&self, report: &Report, what: &str) -> String {
-        if self.all {
-            return what.to_owned();
+    /// What is shown, and of how many states (and actions, for `pairs`) it is a part.
+    fn note(&self, report: &Report, what: &str, pairs: bool) -> String {
+        let mut note = what.to_owned();
+        if self.states.len() < report.states() {
+            let _ = write!(note, "; {} of {} states", self.states.len(), count(f64::from(report.n_states)));
         }
-        let (states, actions) = (self.states.len(), self.actions.len());
-        let (of_states, of_actions) = (f64::from(report.n_states), f64::from(report.n_actions));
-        match (states < report.states(), actions < report.actions()) {
-            (true, false) => format!("{what}; the {states} states visited most of {}", count(of_states)),
-            (false, _) => format!("{what}; the {actions} actions taken most of {}", count(of_actions)),
-            (true, true) => {
-                format!("{what}; {states} of {} states, {actions} of {} actions", count(of_states), count(of_actions))
-            }
+        if pairs && self.actions.len() < report.actions() {
+            let _ = write!(note, "; {} of {} actions", self.actions.len(), count(f64::from(report.n_actions)));
+        }
+        note
+    }
+
+    /// What to add to a caption where not everything is shown.
+    fn omission(&self, report: &Report) -> &'static str {
+        if self.states.len() < report.states() || self.actions.len() < report.actions() {
+            " Shown are the states visited most and the actions taken most; the table has more."
+        } else {
+            ""
         }
     }
 
@@ -96,7 +93,6 @@ pub(super) fn pictures(report: &Report, visits: bool) -> Result<Vec<Picture>, Re
             &layout,
             ("policy_table", "Policy", "probability of each action"),
             &report.policy,
-            Scale::from_zero([1.0]),
             "The probability with which the learned policy, as it explains the demonstrations, takes each action; each row sums to 1.",
         )?,
         pairs(
@@ -104,7 +100,6 @@ pub(super) fn pictures(report: &Report, visits: bool) -> Result<Vec<Picture>, Re
             &layout,
             ("reward_table", "Reward", "learned reward of each action"),
             &report.reward,
-            Scale::from_zero(report.reward.iter().copied()),
             "The learned reward of each action in each state. A reward is known up to its scale only; names in grey are states \
              that the demonstrations do not visit.",
         )?,
@@ -133,13 +128,15 @@ fn pairs(
     layout: &Layout,
     (name, heading, what): (&'static str, &'static str, &str),
     values: &[f64],
-    scale: Scale,
     caption: &str,
 ) -> Result<Picture, ReportError> {
     let size = (WIDTH, TITLE + layout.names + layout.height() + BAR);
-    let note = layout.note(report, what);
+    let note = layout.note(report, what, true);
+    let (factor, unit) = unit(values);
+    let values: Vec<f64> = values.iter().map(|value| value / factor).collect();
     let svg = Canvas::draw(name, size, &format!("{heading}: {note}"), |canvas| {
         title(canvas, MARGIN, 0.0, WIDTH - 2.0 * MARGIN, heading, &note);
+        let scale = Scale::from_zero(if name == "policy_table" { vec![1.0] } else { values.clone() });
         let (left, top) = (layout.left, TITLE + layout.names);
         for (j, &action) in layout.actions.iter().enumerate() {
             let (x, text) = (left + (j as f64 + 0.5) * layout.column, report.action_name(action, 22));
@@ -170,9 +167,23 @@ fn pairs(
             let x = left + j as f64 * layout.column;
             canvas.path(&[(x, top), (x, top + layout.height())], EMPTY, 0.8);
         }
-        bar(canvas, left, top + layout.height(), WIDTH - MARGIN - left, &scale, &heading.to_lowercase(), false);
+        bar(
+            canvas,
+            left,
+            top + layout.height(),
+            WIDTH - MARGIN - left,
+            &scale,
+            &format!("{}{unit}", heading.to_lowercase()),
+            false,
+        );
     })?;
-    Ok(Picture { name, part: Part::Learned, title: heading, caption: caption.to_owned(), svg })
+    Ok(Picture {
+        name,
+        part: Part::Learned,
+        title: heading,
+        caption: format!("{caption}{}", layout.omission(report)),
+        svg,
+    })
 }
 
 /// A number of each state as a bar; bars start at zero.
@@ -184,7 +195,7 @@ fn bars(
     caption: &str,
 ) -> Result<Picture, ReportError> {
     let size = (WIDTH, TITLE + layout.height() + MARGIN);
-    let note = layout.note(report, what);
+    let note = layout.note(report, what, false);
     let svg = Canvas::draw(name, size, &format!("{heading}: {note}"), |canvas| {
         title(canvas, MARGIN, 0.0, WIDTH - 2.0 * MARGIN, heading, &note);
         layout.state_names(canvas, report, TITLE);
@@ -206,5 +217,5 @@ fn bars(
         }
         canvas.path(&[(zero, TITLE), (zero, TITLE + layout.height())], MUTED, 0.8);
     })?;
-    Ok(Picture { name, part, title: heading, caption: caption.to_owned(), svg })
+    Ok(Picture { name, part, title: heading, caption: format!("{caption}{}", layout.omission(report)), svg })
 }

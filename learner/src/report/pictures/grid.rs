@@ -4,7 +4,7 @@ use super::canvas::{Canvas, Type, text_width};
 use super::colour::{DIFFERS, INK, RULE, Scale, WALL};
 use super::panel::{BAR, MARGIN, TITLE, WIDTH, bar, not_visited, title};
 use super::{Part, Picture};
-use crate::report::format::{alike, count};
+use crate::report::format::{alike, count, unit};
 use crate::report::space::Heading;
 use crate::report::{GridLayout, Report, ReportError};
 use plotters::style::{Color, RGBAColor};
@@ -197,18 +197,23 @@ fn paint(canvas: &Canvas<'_>, report: &Report, geometry: &Geometry, panel: &Pane
     let room = WIDTH - 2.0 * MARGIN;
     match &panel.content {
         Content::Heat { values, scale, bar: name, hatch } => {
-            let write = alike(values.iter().copied());
+            let (factor, unit) = unit(values);
+            let write = alike(values.iter().map(|value| value / factor));
             let whole = *name == "visits";
             for (state, &index) in grid.cells.iter().enumerate() {
                 let (x, y) = place(index);
                 let value = values[state];
                 canvas.rect(x, y, cell, cell, scale.colour(value));
-                if *hatch && !report.visited(state) {
+                let hatched = *hatch && !report.visited(state);
+                if hatched {
                     canvas.hatch(x, y, cell, cell);
                 }
-                let text = if whole { count(value) } else { write(value) };
+                let text = if whole { count(value) } else { write(value / factor) };
                 // Zeros are left to the eye: a field of them hides the rest.
                 if value != 0.0 && text_width(&text, 11.0) < cell - 2.0 {
+                    if hatched {
+                        canvas.rect(x + 2.0, y + cell / 2.0 - 7.5, cell - 4.0, 15.0, scale.colour(value));
+                    }
                     canvas.text(
                         x + cell / 2.0,
                         y + cell / 2.0,
@@ -219,7 +224,11 @@ fn paint(canvas: &Canvas<'_>, report: &Report, geometry: &Geometry, panel: &Pane
                 canvas.outline(x, y, cell, cell, RULE, 0.7);
             }
             let unvisited = *hatch && (0..report.states()).any(|state| !report.visited(state));
-            bar(canvas, x + MARGIN, foot, room, scale, name, unvisited);
+            let (scale, name) = (
+                scale.divided(if whole { 1.0 } else { factor }),
+                if whole { (*name).to_owned() } else { format!("{name}{unit}") },
+            );
+            bar(canvas, x + MARGIN, foot, room, &scale, &name, unvisited);
         }
         Content::Policy { policy, reference, hatch } => {
             let headings = report.headings().unwrap_or_default();

@@ -4,7 +4,7 @@ use super::canvas::{Canvas, Type};
 use super::colour::{INK, MUTED, PAPER, RULE, Scale};
 use super::panel::{BAR, MARGIN, TITLE, WIDTH, bar, not_visited, title};
 use super::{Part, Picture};
-use crate::report::format::{alike, count};
+use crate::report::format::{alike, count, unit};
 use crate::report::space::{LANES, LaneChange, SPEEDS_MPS, TRAFFIC, highway_action, highway_state};
 use crate::report::{Report, ReportError};
 use plotters::style::{Color, RGBAColor, RGBColor};
@@ -47,9 +47,7 @@ pub(super) fn pictures(report: &Report) -> Result<Vec<Picture>, ReportError> {
                       only: compare states with each other. A state that the demonstrations do not visit says nothing."
                 .into(),
             svg: Canvas::draw("reward", SIZE, "Learned reward of the greedy action in each of the 36 states", |canvas| {
-                let scale = Scale::from_zero(rewards.iter().copied());
-                let note = "of the greedy action in each state";
-                heat(canvas, report, ("Learned reward", note, "reward"), (&rewards, scale, alike(rewards.iter().copied())));
+                numbers(canvas, report, ("Learned reward", "of the greedy action in each state", "reward"), &rewards, Scale::from_zero);
             })?,
         },
         Picture {
@@ -69,10 +67,8 @@ pub(super) fn pictures(report: &Report) -> Result<Vec<Picture>, ReportError> {
             title: "State values",
             caption: "How good it is to be in each state: the expected discounted sum of the learned reward.".into(),
             svg: Canvas::draw("values", SIZE, "Value of each of the 36 states under the learned reward", |canvas| {
-                let values = &report.state_values;
-                let scale = Scale::over(values.iter().copied());
-                let note = "expected discounted sum of the learned reward";
-                heat(canvas, report, ("State values", note, "value"), (values, scale, alike(values.iter().copied())));
+                let names = ("State values", "expected discounted sum of the learned reward", "value");
+                numbers(canvas, report, names, &report.state_values, Scale::over);
             })?,
         },
     ])
@@ -112,6 +108,20 @@ fn frame(canvas: &Canvas<'_>, report: &Report, name: &str, note: &str) {
     }
     canvas.text(left + 2.0 * COLUMN, foot + 16.0, "present speed, m/s", muted.centred());
     canvas.text(left - 8.0, foot, "lane", muted.right());
+}
+
+/// A heat map of numbers in a unit in which they are short.
+fn numbers(
+    canvas: &Canvas<'_>,
+    report: &Report,
+    (name, note, what): (&str, &str, &str),
+    values: &[f64],
+    scale: impl Fn(Vec<f64>) -> Scale,
+) {
+    let (factor, unit) = unit(values);
+    let values: Vec<f64> = values.iter().map(|value| value / factor).collect();
+    let write = alike(values.iter().copied());
+    heat(canvas, report, (name, note, &format!("{what}{unit}")), (&values, scale(values.clone()), write));
 }
 
 fn heat(

@@ -42,7 +42,7 @@ impl Layout {
         }
         let longest = states.iter().map(|&s| text_width(&report.state_name(s, 60), SET)).fold(40.0, f64::max);
         let left = MARGIN + (longest + 10.0).min(STATE_NAMES);
-        let column = ((WIDTH - MARGIN - left) / actions.len().max(1) as f64).min(80.0);
+        let column = ((WIDTH - MARGIN - left) / actions.len().max(1) as f64).min(96.0);
         let row = if states.len() > 20 { 15.0 } else { 22.0 };
         let longest = actions.iter().map(|&a| text_width(&report.action_name(a, 22), SET)).fold(0.0, f64::max);
         Self { states, actions, row, column, left, names: if longest < column - 4.0 { 20.0 } else { longest + 12.0 } }
@@ -108,14 +108,14 @@ pub(super) fn pictures(report: &Report, visits: bool) -> Result<Vec<Picture>, Re
         pictures.push(bars(
             report,
             &layout,
-            ("visits", Part::Seen, "Visits", "steps of the demonstrations in each state"),
+            ("visits", Part::Seen, "Visits", "demonstrated steps in each state"),
             &report.state_visits,
             "How often the demonstrations visit each state: all that the learner knows of the expert.",
         )?);
         pictures.push(bars(
             report,
             &layout,
-            ("values", Part::Learned, "State values", "expected discounted sum of the learned reward"),
+            ("values", Part::Learned, "State values", "expected discounted reward"),
             &report.state_values,
             "How good it is to be in each state under the learned reward.",
         )?);

@@ -1,18 +1,219 @@
-//! `learner fit`.
+//! `learner fit`: drive, record, learn, and look.
+//!
+//! One path: without running services the real ones are started in process, on loopback ports, and talked to through the same
+//! client. What a person reads goes to standard output a line a step; see [`narrate`].
 
-use super::{StoreArgs, error::CliError};
-use clap::Args;
+mod args;
+mod assemble;
+mod evaluate;
+mod job;
+mod narrate;
+mod recordings;
+mod services;
 
-/// What to fit, and how.
-#[derive(Debug, Args)]
-pub struct FitArgs {
-    /// Where recordings are read from and the fit is kept.
-    #[command(flatten)]
-    pub store: StoreArgs,
-}
+pub use args::FitArgs;
+
+use super::error::CliError;
+use assemble::Truth;
+use evaluate::Policies;
+use job::Job;
+use mazeway_client::Model;
+use mazeway_learner::{
+    mdp::{PlanOptions, PlannerKind, TabularMdp, plan},
+    report::{self, json, table::Terminal, write},
+};
+use mazeway_proto::learner::FitRequest;
+use narrate::Narrator;
+use recordings::{Expert, Recordings};
+use services::Services;
+use std::{path::Path, time::Instant};
 
 /// Fits and reports.
-#[expect(clippy::unused_async, reason = "the fit itself awaits the services")]
+///
+/// # Errors
+/// Wrong usage, nothing to learn from, a service that fails, a report that cannot be written.
 pub async fn run(args: FitArgs) -> Result<(), CliError> {
-    Err(CliError::failure(format!("cannot fit from {:?} yet", args.store), "see 'learner --help'"))
+    let job = Job::new(&args)?;
+    let narrator = Narrator::new(args.json);
+    let services = Services::start(&args, narrator).await?;
+    let outcome = tokio::select! {
+        outcome = fit(&args, &job, &services, narrator) => outcome,
+        // Dropping the calls cancels them; what was acknowledged is stored.
+        _ = tokio::signal::ctrl_c() => Err(CliError::failure(
+            "interrupted",
+            "what was recorded is stored; the same command goes on from there",
+        )),
+    };
+    services.stop().await;
+    outcome
+}
+
+async fn fit(args: &FitArgs, job: &Job, services: &Services, narrator: Narrator) -> Result<(), CliError> {
+    let begun = Instant::now();
+    let spec = services.spec(&job.env_id).await?;
+    let style = match &job.style {
+        Some(style) => style.clone(),
+        None => spec.styles.first().cloned().unwrap_or_default(),
+    };
+
+    let spinner = narrator.spinner("model");
+    let model = services.model(job).await?;
+    services.put_model(&model).await?;
+    spinner.finish_and_clear();
+    narrator.step("model", describe(&model))?;
+
+    let mdp = checked(&model)?;
+    let truth = truth(job, &style, &model, &mdp)?;
+    let expert = match &truth {
+        Some(truth) => Some(Expert::optimal(truth.optimal_policy.clone(), job.discount())),
+        None => spec.drivers.iter().any(|(name, _)| *name == style && name != "random").then(|| Expert::driver(&style)),
+    };
+    if expert.is_none() && job.style.is_some() && !spec.styles.contains(&style) {
+        tracing::debug!(style, "no scripted expert of this style");
+    }
+    let recordings = recordings::find(job, &style, &model, expert.as_ref(), services, narrator).await?;
+
+    let fit = learn(job, &model, &recordings, services, narrator).await?;
+    let learned = assemble::Learned::new(&fit)?;
+    let policies = Policies { greedy: &learned.greedy_policy, stochastic: &learned.policy, n_actions: model.n_actions as usize };
+    let judged = evaluate::judge(job, &spec, policies, expert.as_ref(), services, narrator).await?;
+    narrator.step(
+        "judged",
+        format_args!("{} episodes of up to {} steps a driver", judged.evaluation.episodes, judged.evaluation.steps),
+    )?;
+    let frame = evaluate::frame(job, &learned.greedy_policy, policies.n_actions, services).await?;
+    let sources = services.sources(&recordings).await?;
+
+    let out = match &args.out {
+        Some(out) => out.clone(),
+        None => services.data().join("reports").join(directory_name(&[&job.env_id, &style, job.method])),
+    };
+    let report = assemble::report(assemble::Parts {
+        job,
+        style: &style,
+        model,
+        mdp: &mdp,
+        truth,
+        fit,
+        learned,
+        judged,
+        frame,
+        sources,
+        begun,
+    })?;
+    show(&report, &out, args.json, narrator)
+}
+
+/// Fits on the recordings, with a bar while it runs.
+async fn learn(
+    job: &Job,
+    model: &Model,
+    recordings: &Recordings,
+    services: &Services,
+    narrator: Narrator,
+) -> Result<mazeway_proto::learner::Fit, CliError> {
+    let basis = job.basis.unwrap_or_else(|| job::default_basis(&job.env_id));
+    let mut options = job.options;
+    options.horizon = recordings.horizon;
+    options.basis = basis.into();
+    let request = FitRequest {
+        method: job.method.to_owned(),
+        filter: Some(recordings.filter.clone()),
+        max_trajectories: recordings.trajectories,
+        model_id: model.model_id.clone(),
+        options: Some(options),
+    };
+    let spinner = narrator.spinner("fit");
+    let fit = services
+        .fit(request, |progress| {
+            spinner.set_message(format!("iteration {}, objective {:.6}", progress.iteration, progress.objective));
+        })
+        .await?;
+    spinner.finish_and_clear();
+    narrator.step(
+        "fitted",
+        format_args!(
+            "{} on {} trajectories in {}; fit {}",
+            job.method,
+            fit.trajectory_ids.len(),
+            report::seconds(fit.fit_secs),
+            fit.fit_id,
+        ),
+    )?;
+    Ok(fit)
+}
+
+/// The true reward and the optimal policy under it, where the model is exact and carries the style's reward.
+fn truth(job: &Job, style: &str, model: &Model, mdp: &TabularMdp) -> Result<Option<Truth>, CliError> {
+    let Some(reward) = model.reward(style).filter(|_| !model.estimated) else { return Ok(None) };
+    let options = PlanOptions { discount: job.discount(), ..PlanOptions::default() };
+    let optimal = plan(PlannerKind::PolicyIteration, mdp, reward, &options).map_err(|error| {
+        CliError::failure(format!("cannot plan under the true reward: {error}"), "try another --discount")
+    })?;
+    Ok(Some(Truth { reward: reward.to_vec(), optimal_policy: optimal.greedy_policy().into_probabilities() }))
+}
+
+fn checked(model: &Model) -> Result<TabularMdp, CliError> {
+    TabularMdp::new(
+        model.n_states as usize,
+        model.n_actions as usize,
+        model.row_offsets.clone(),
+        model.next_states.clone(),
+        model.probabilities.clone(),
+        Some(model.initial_distribution.clone()),
+    )
+    .map_err(|error| {
+        CliError::failure(format!("the server's model is not one: {error}"), "check the server's version with 'server --version'")
+    })
+}
+
+fn describe(model: &Model) -> String {
+    let visits: u64 = model.visit_counts.iter().flatten().sum();
+    let origin = if model.estimated { format!("estimated from {visits} simulated steps") } else { "exact".to_owned() };
+    format!(
+        "{}: {} states, {} actions, {} transitions, {origin}",
+        model.env_id,
+        model.n_states,
+        model.n_actions,
+        model.next_states.len(),
+    )
+}
+
+/// Prints the tables or the object, and where the report is.
+fn show(report: &report::Report, out: &Path, json: bool, narrator: Narrator) -> Result<(), CliError> {
+    let fail = |error: report::ReportError| {
+        CliError::failure(error.to_string(), "choose a directory that you may write to with --out DIR")
+    };
+    let written = write::write(report, out).map_err(fail)?;
+    if json {
+        let mut object = json::to_string(report, Some(&written.html));
+        object.push('\n');
+        return Ok(std::io::Write::write_all(&mut std::io::stdout().lock(), object.as_bytes())?);
+    }
+    narrator.line("")?;
+    narrator.line(report::table::render(report, Terminal::stdout()).map_err(fail)?)?;
+    narrator.step("report", written.html.display())?;
+    for picture in &written.pictures {
+        narrator.step("picture", picture.display())?;
+    }
+    Ok(())
+}
+
+/// A directory's name from names that may hold anything.
+fn directory_name(names: &[&str]) -> String {
+    let safe = |name: &str| -> String {
+        name.chars().map(|c| if c.is_alphanumeric() || "-_.".contains(c) { c } else { '_' }).collect()
+    };
+    names.iter().map(|name| safe(name)).collect::<Vec<_>>().join("-")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::directory_name;
+
+    #[test]
+    fn a_directory_is_one_component_whatever_the_style() {
+        assert_eq!(directory_name(&["Highway-v0", "aggressive", "em-tied"]), "Highway-v0-aggressive-em-tied");
+        assert_eq!(directory_name(&["Maze-v0", "../../x y/z"]), "Maze-v0-.._.._x_y_z");
+    }
 }

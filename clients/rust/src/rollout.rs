@@ -241,9 +241,19 @@ impl EpisodeStream {
     ///
     /// # Errors
     /// The server failed or broke off.
-    pub async fn collect(mut self) -> Result<Episodes, ClientError> {
+    pub async fn collect(self) -> Result<Episodes, ClientError> {
+        self.collect_with(|_| ()).await
+    }
+
+    /// As [`EpisodeStream::collect`], and tells of every part as it comes.
+    ///
+    /// # Errors
+    /// The server failed or broke off.
+    pub async fn collect_with(mut self, mut arrived: impl FnMut(&Episodes)) -> Result<Episodes, ClientError> {
         let mut all = self.next().await?.unwrap_or_default();
+        arrived(&all);
         while let Some(more) = self.next().await? {
+            arrived(&more);
             all.append(more);
         }
         Ok(all)

@@ -1,5 +1,6 @@
 //! Flags of `learner fit`, as typed. Nothing here is checked against anything but itself.
 
+use crate::cli::StoreArgs;
 use clap::{Args, ValueEnum};
 use std::path::PathBuf;
 
@@ -143,15 +144,12 @@ pub struct FitArgs {
     #[arg(long, default_value_t = 400, value_name = "N", value_parser = clap::value_parser!(u32).range(2..=1_000_000))]
     pub rollouts: u32,
 
-    /// Address of a running learner service [default: start one on the data directory]
-    #[arg(long, value_name = "HOST:PORT", conflicts_with = "data", help_heading = "Where")]
-    pub addr: Option<String>,
+    /// Where recordings are read from and the fit is kept
+    #[command(flatten)]
+    pub store: StoreArgs,
     /// Address of a running environment server [default: the learner's host at port 50051 with --addr, else start one]
     #[arg(long, value_name = "HOST:PORT", help_heading = "Where")]
     pub env_addr: Option<String>,
-    /// Directory of recordings, models and fits [default: the platform's data directory]
-    #[arg(long, env = "MAZEWAY_DATA", value_name = "DIR", help_heading = "Where")]
-    pub data: Option<PathBuf>,
     /// Directory for the report and its pictures [default: reports/ENV-STYLE-METHOD in the data directory]
     #[arg(long, value_name = "DIR", help_heading = "Where")]
     pub out: Option<PathBuf>,

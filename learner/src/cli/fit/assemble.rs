@@ -111,7 +111,7 @@ pub fn report(parts: Parts<'_>) -> Result<Report, CliError> {
     let (agreement, difference) = match &truth {
         Some(truth) => {
             let greedy = Policy::new(n_actions, learned.greedy_policy.clone()).map_err(|error| wrong(&error))?;
-            let lost = eval::expected_value_difference(mdp, &greedy, &truth.reward, options.discount, options.horizon)
+            let lost = eval::expected_value_difference(mdp, &truth.reward, options.discount, options.horizon, &greedy)
                 .map_err(|error| wrong(&error))?;
             let agreement = eval::state_agreement(&learned.greedy_policy, &truth.optimal_policy, n_actions);
             (agreement, Some(lost.difference))

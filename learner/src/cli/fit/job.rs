@@ -3,9 +3,10 @@
 use super::args::{
     BasisArg, FitArgs, HorizonPriorArg, MStepArg, PenaltyArg, PlannerArg, ResponsibilityArg,
 };
-use crate::{cli::CliError, irl};
+use crate::cli::error::CliError;
+use mazeway_client::Options;
+use mazeway_learner::irl;
 use mazeway_proto::learner::{self as pb, FitOptions};
-use std::collections::BTreeMap;
 
 /// Which recordings a fit learns from.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -26,7 +27,7 @@ pub struct Job {
     /// Environment.
     pub env_id: String,
     /// Options of the environment.
-    pub env_options: BTreeMap<String, serde_json::Value>,
+    pub env_options: Options,
     /// Style; `None`: the environment's first.
     pub style: Option<String>,
     /// Method id.
@@ -60,6 +61,11 @@ pub fn default_basis(env_id: &str) -> pb::Basis {
 }
 
 impl Job {
+    /// Discount of the fit, and of the optimal expert.
+    pub fn discount(&self) -> f64 {
+        self.options.discount.unwrap_or(0.9)
+    }
+
     /// Checks the flags.
     ///
     /// # Errors

@@ -3,17 +3,14 @@
 //! Invariants: a scripted demonstration is a function of the model, the style and the settings, and its UUID a function of its
 //! content, so that a run cut off half-way is completed by the next one and never recorded twice.
 
-use super::{job::{Job, Source}, narrate::Narrator, services::{Rollout, Services}};
+use super::{job::{Job, Source}, narrate::Narrator, services::Services};
 use crate::cli::error::CliError;
-use mazeway_client::{Controller, Episodes, Model, pack};
+use mazeway_client::{Controller, Demonstration, Episodes, Model, Rollout};
 use mazeway_proto::learner::{Trajectory, TrajectoryFilter};
 use uuid::Uuid;
 
 /// Namespace of the UUIDs of scripted demonstrations.
 const NAMESPACE: Uuid = Uuid::from_u128(0x6d61_7a65_7761_7900_8000_0000_0000_0001);
-
-/// Trajectories in one message.
-const CHUNK: usize = 50;
 
 /// Steps that a scripted driver drives before a snapshot, so that snapshots show it in traffic rather than at the start.
 const BURN_IN_STEPS: u32 = 20;
@@ -85,7 +82,7 @@ pub async fn find(
     style: &str,
     model: &Model,
     expert: Option<&Expert>,
-    services: &mut Services,
+    services: &Services,
     narrator: Narrator,
 ) -> Result<Recordings, CliError> {
     let base = TrajectoryFilter {
@@ -149,7 +146,7 @@ async fn demonstrated(
     style: &str,
     model: &Model,
     expert: &Expert,
-    services: &mut Services,
+    services: &Services,
     narrator: Narrator,
 ) -> Result<Recordings, CliError> {
     let (default_trajectories, default_horizon) = super::job::default_sizes(&job.env_id);
@@ -182,19 +179,18 @@ async fn demonstrated(
         if found > 0 {
             narrator.step("found", format_args!("{found} of {wanted} recordings of style '{style}' by {source}"))?;
         }
-        let episodes = services
-            .rollout(job, Rollout {
-                controller: expert.controller.clone(),
-                seed: first,
-                episodes: wanted,
-                steps,
-                burn_in_steps: expert.burn_in_steps,
-                totals_only: false,
-            })
-            .await?;
+        let rollout = Rollout {
+            options: job.env_options.clone(),
+            seed: first,
+            burn_in_steps: expert.burn_in_steps,
+            ..Rollout::new(&job.env_id, expert.controller.clone(), wanted, steps)
+        };
+        let bar = narrator.bar("drive", u64::from(wanted));
+        let episodes = services.rollout(rollout, |episodes| bar.inc(episodes)).await?;
+        bar.finish_and_clear();
+        let bar = narrator.bar("record", u64::from(wanted));
         let trajectories = trajectories(job, style, model, &source, first, &episodes);
-        let bar = narrator.bar("record", trajectories.len() as u64);
-        let stored = services.record(trajectories, CHUNK, |n| bar.inc(n as u64)).await?;
+        let stored = services.record(trajectories, |acknowledged| bar.set_position(acknowledged)).await?;
         bar.finish_and_clear();
         narrator.step("recorded", format_args!("{stored} demonstrations of {steps} steps by {source}"))?;
     }
@@ -214,23 +210,21 @@ fn trajectories(
         .iter()
         .enumerate()
         .map(|(rank, episode)| {
-            let seed = first_seed + rank as u64;
-            let mut trajectory = Trajectory {
-                trajectory_id: String::new(),
+            let mut trajectory = Trajectory::from(Demonstration {
                 env_id: job.env_id.clone(),
                 model_id: model.model_id.clone(),
                 style: style.to_owned(),
                 source: source.to_owned(),
-                seed: Some(seed),
+                seed: Some(first_seed + rank as u64),
                 n_states: model.n_states,
                 n_actions: model.n_actions,
-                states: pack(episode.states.iter().map(|&state| state as i32)),
-                actions: pack(episode.actions.iter().map(|&action| action as i32)),
-                rewards: pack(episode.rewards.iter().copied()),
+                states: episode.states.to_vec(),
+                actions: episode.actions.to_vec(),
+                rewards: episode.rewards.to_vec(),
                 final_state: Some(episode.final_state),
                 terminated: episode.terminated,
                 truncated: false,
-            };
+            });
             trajectory.trajectory_id = content_uuid(&trajectory).to_string();
             trajectory
         })

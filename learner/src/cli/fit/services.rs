@@ -1,0 +1,199 @@
+//! The two services behind a fit: running ones where addresses are given, else the real ones started in process on loopback
+//! ports. Everything else in `learner fit` sees a connection and not how it came about.
+
+use super::{args::FitArgs, job::Job, narrate::Narrator, recordings::Recordings};
+use crate::cli::{embedded::{self, Embedded}, error::CliError};
+use mazeway_client::{Connection, Env, EnvSpec, Episodes, Learner, Model, Rollout, SessionOptions};
+use mazeway_learner::report::Source;
+use mazeway_proto::learner::{Fit, FitProgress, FitRequest, Trajectory, TrajectoryFilter};
+use std::{
+    collections::BTreeMap,
+    path::{Path, PathBuf},
+};
+
+/// Port of an environment server beside a learner service, where none is named.
+const ENVIRONMENTS_PORT: u16 = 50051;
+
+/// Connections, and the guards of what was started for them.
+pub struct Services {
+    environments: Connection,
+    learner: Learner,
+    data: PathBuf,
+    embedded: Vec<Embedded>,
+}
+
+impl Services {
+    /// Connects to the services that the arguments name, and starts those that they do not name.
+    ///
+    /// # Errors
+    /// Nobody answers at an address; a data directory that cannot be used.
+    pub async fn start(args: &FitArgs, narrator: Narrator) -> Result<Self, CliError> {
+        let mut running = Vec::new();
+        let data = embedded::data_directory(args.store.data.as_deref())?;
+        let learner_address = match &args.store.addr {
+            Some(address) => address.clone(),
+            None => {
+                let learner = embedded::learner(&data).await?;
+                let address = learner.address();
+                running.push(learner);
+                narrator.step("started", format_args!("learner service at {address}, data in {}", data.display()))?;
+                address
+            }
+        };
+        let environments_address = match (&args.env_addr, &args.store.addr) {
+            (Some(address), _) => address.clone(),
+            (None, Some(learner)) => beside(learner),
+            (None, None) => {
+                let server = embedded::environments().await?;
+                let address = server.address();
+                running.push(server);
+                narrator.step("started", format_args!("environment server at {address}"))?;
+                address
+            }
+        };
+        let learner = Learner::connect(&learner_address).await.map_err(|error| {
+            CliError::failure(error.to_string(), format!("start one with 'learner serve --listen {learner_address}'"))
+        })?;
+        let environments = Connection::open(&environments_address).await.map_err(|error| {
+            CliError::failure(
+                error.to_string(),
+                format!("start one with 'server --listen {environments_address}', or name another with --env-addr"),
+            )
+        })?;
+        if args.store.addr.is_some() {
+            narrator.step("connected", format_args!("learner at {learner_address}, environments at {environments_address}"))?;
+        }
+        Ok(Self { environments, learner, data, embedded: running })
+    }
+
+    /// Stops what was started.
+    pub async fn stop(self) {
+        drop((self.environments, self.learner));
+        for service in self.embedded {
+            service.stop().await;
+        }
+    }
+
+    /// Directory of reports.
+    pub fn data(&self) -> &Path {
+        &self.data
+    }
+
+    /// Description of an environment.
+    ///
+    /// # Errors
+    /// There is none of that name.
+    pub async fn spec(&self, env_id: &str) -> Result<EnvSpec, CliError> {
+        let mut specs = self.environments.list_environments().await?;
+        match specs.iter().position(|spec| spec.env_id == env_id) {
+            Some(rank) => Ok(specs.swap_remove(rank)),
+            None => {
+                let known: Vec<_> = specs.iter().map(|spec| spec.env_id.as_str()).collect();
+                Err(CliError::usage(
+                    format!("unknown environment '{env_id}' for --env"),
+                    format!("choose one of {}", known.join(", ")),
+                ))
+            }
+        }
+    }
+
+    /// The environment's tabular model.
+    ///
+    /// # Errors
+    /// Wrong options; the server fails.
+    pub async fn model(&self, job: &Job) -> Result<Model, CliError> {
+        Ok(self.environments.model(&job.env_id, &job.env_options).await?)
+    }
+
+    /// Keeps a model in the learner.
+    ///
+    /// # Errors
+    /// The learner refuses it.
+    pub async fn put_model(&self, model: &Model) -> Result<(), CliError> {
+        self.learner.put_model(model).await?;
+        Ok(())
+    }
+
+    /// Has the server drive; tells of episodes as they come.
+    ///
+    /// # Errors
+    /// The server refuses or fails.
+    pub async fn rollout(&self, rollout: Rollout, mut arrived: impl FnMut(u64)) -> Result<Episodes, CliError> {
+        let stream = self.environments.rollout_stream(rollout).await?;
+        Ok(stream.collect_with(|episodes| arrived(episodes.len() as u64)).await?)
+    }
+
+    /// An environment to step.
+    ///
+    /// # Errors
+    /// The server refuses.
+    pub async fn env(&self, env_id: &str, options: SessionOptions) -> Result<Env, CliError> {
+        Ok(Env::create(&self.environments, env_id, options).await?)
+    }
+
+    /// How many recordings a filter selects.
+    ///
+    /// # Errors
+    /// The learner fails.
+    pub async fn count(&self, filter: &TrajectoryFilter) -> Result<u64, CliError> {
+        Ok(self.learner.count_trajectories(filter).await?)
+    }
+
+    /// Records; returns how many were not stored before, once all are on stable storage.
+    ///
+    /// # Errors
+    /// The learner refuses one or fails.
+    pub async fn record(&self, trajectories: Vec<Trajectory>, mut acknowledged: impl FnMut(u64)) -> Result<u64, CliError> {
+        let mut recorder = self.learner.recorder();
+        for trajectory in trajectories {
+            recorder.record(trajectory).await?;
+            acknowledged(recorder.receipt().acknowledged());
+        }
+        Ok(recorder.finish().await?.stored)
+    }
+
+    /// Fits.
+    ///
+    /// # Errors
+    /// The learner refuses or fails.
+    pub async fn fit(&self, request: FitRequest, progress: impl FnMut(&FitProgress)) -> Result<Fit, CliError> {
+        Ok(self.learner.fit(request, progress).await?)
+    }
+
+    /// Where the recordings that a fit used came from, and how many from each.
+    ///
+    /// # Errors
+    /// The learner fails.
+    pub async fn sources(&self, recordings: &Recordings) -> Result<Vec<Source>, CliError> {
+        let one = &recordings.filter.source;
+        if !one.is_empty() {
+            return Ok(vec![Source { name: one.clone(), trajectories: u64::from(recordings.trajectories) }]);
+        }
+        let mut counts = BTreeMap::<String, u64>::new();
+        let used = self.learner.list_trajectories(&recordings.filter).await?;
+        for summary in used.into_iter().take(recordings.trajectories as usize) {
+            *counts.entry(summary.source).or_default() += 1;
+        }
+        Ok(counts.into_iter().map(|(name, trajectories)| Source { name, trajectories }).collect())
+    }
+}
+
+/// The same host at the environment server's usual port.
+fn beside(learner: &str) -> String {
+    match learner.rsplit_once(':') {
+        Some((host, _)) => format!("{host}:{ENVIRONMENTS_PORT}"),
+        None => format!("{learner}:{ENVIRONMENTS_PORT}"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::beside;
+
+    #[test]
+    fn the_environment_server_lives_beside_the_learner() {
+        assert_eq!(beside("127.0.0.1:50052"), "127.0.0.1:50051");
+        assert_eq!(beside("[::1]:7"), "[::1]:50051");
+        assert_eq!(beside("http://robots.example:50052"), "http://robots.example:50051");
+    }
+}

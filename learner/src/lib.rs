@@ -20,4 +20,4 @@ pub mod trajectory;
 #[cfg(feature = "service")]
 pub use config::Config;
 #[cfg(feature = "service")]
-pub use grpc::{CallError, ServeError, fit_options, serve};
+pub use grpc::{CallError, ServeError, fit_options, serve, stopped};

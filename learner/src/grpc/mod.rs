@@ -14,7 +14,7 @@ mod service;
 mod status;
 mod to_proto;
 
-pub use options::from_proto as fit_options;
+pub use options::{from_proto as fit_options, stopped_from_proto as stopped};
 pub use serve::{ServeError, serve};
 pub use status::CallError;
 

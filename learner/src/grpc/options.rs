@@ -110,6 +110,17 @@ pub fn stopped(stopped: Stopped) -> pb::Stopped {
     }
 }
 
+/// How a fit stopped, from the wire; `None` for a way that this version does not know.
+pub fn stopped_from_proto(message: i32) -> Option<Stopped> {
+    match pb::Stopped::try_from(message).ok()? {
+        pb::Stopped::Converged => Some(Stopped::Converged),
+        pb::Stopped::MaxIterations => Some(Stopped::MaxIterations),
+        pb::Stopped::Stalled => Some(Stopped::Stalled),
+        pb::Stopped::ClosedForm => Some(Stopped::ClosedForm),
+        pb::Stopped::Unspecified => None,
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -106,7 +106,7 @@ pub(crate) fn percent(share: f64) -> String {
 }
 
 /// A time span: `0.21 s`, `12.4 s`, `3 min 20 s`.
-pub(crate) fn duration(secs: f64) -> String {
+pub fn duration(secs: f64) -> String {
     match secs {
         _ if !secs.is_finite() || secs < 0.0 => MISSING.to_owned(),
         _ if secs < 0.001 => "< 1 ms".to_owned(),

@@ -18,19 +18,11 @@ pub mod table;
 mod tests;
 pub mod write;
 
+pub use crate::eval::Interval;
+pub use format::duration;
+
 use crate::irl::{FitOptions, Stopped, TraceEntry};
 use serde::{Deserialize, Serialize};
-
-/// A mean with its 95 % confidence interval, in the unit of the mean.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct Interval {
-    /// Estimate.
-    pub mean: f64,
-    /// Lower end of the 95 % confidence interval.
-    pub low: f64,
-    /// Upper end of the 95 % confidence interval.
-    pub high: f64,
-}
 
 /// How a driver drives: means per step over roll-outs.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]

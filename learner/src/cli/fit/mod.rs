@@ -44,8 +44,8 @@ pub async fn run(args: FitArgs) -> Result<(), CliError> {
             "what was recorded is stored; the same command goes on from there",
         )),
     };
-    services.stop().await;
-    outcome
+    let stopped = services.stop().await;
+    outcome.and(stopped)
 }
 
 async fn fit(args: &FitArgs, job: &Job, services: &Services, narrator: Narrator) -> Result<(), CliError> {
@@ -68,9 +68,6 @@ async fn fit(args: &FitArgs, job: &Job, services: &Services, narrator: Narrator)
         Some(truth) => Some(Expert::optimal(truth.optimal_policy.clone(), job.discount())),
         None => spec.drivers.iter().any(|(name, _)| *name == style && name != "random").then(|| Expert::driver(&style)),
     };
-    if expert.is_none() && job.style.is_some() && !spec.styles.contains(&style) {
-        tracing::debug!(style, "no scripted expert of this style");
-    }
     let recordings = recordings::find(job, &style, &model, expert.as_ref(), services, narrator).await?;
 
     let fit = learn(job, &model, &recordings, services, narrator).await?;
@@ -136,7 +133,7 @@ async fn learn(
             "{} on {} trajectories in {}; fit {}",
             job.method,
             fit.trajectory_ids.len(),
-            report::seconds(fit.fit_secs),
+            report::duration(fit.fit_secs),
             fit.fit_id,
         ),
     )?;

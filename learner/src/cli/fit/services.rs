@@ -2,7 +2,11 @@
 //! ports. Everything else in `learner fit` sees a connection and not how it came about.
 
 use super::{args::FitArgs, job::Job, narrate::Narrator, recordings::Recordings};
-use crate::cli::{embedded::{self, Embedded}, error::CliError};
+use crate::cli::{
+    data_directory,
+    embedded::{self, Embedded},
+    error::CliError,
+};
 use mazeway_client::{Connection, Env, EnvSpec, Episodes, Learner, Model, Rollout, SessionOptions};
 use mazeway_learner::report::Source;
 use mazeway_proto::learner::{Fit, FitProgress, FitRequest, Trajectory, TrajectoryFilter};
@@ -29,7 +33,7 @@ impl Services {
     /// Nobody answers at an address; a data directory that cannot be used.
     pub async fn start(args: &FitArgs, narrator: Narrator) -> Result<Self, CliError> {
         let mut running = Vec::new();
-        let data = embedded::data_directory(args.store.data.as_deref())?;
+        let data = data_directory(args.store.data.clone())?;
         let learner_address = match &args.store.addr {
             Some(address) => address.clone(),
             None => {
@@ -66,12 +70,16 @@ impl Services {
         Ok(Self { environments, learner, data, embedded: running })
     }
 
-    /// Stops what was started.
-    pub async fn stop(self) {
+    /// Stops what was started, and waits until all that it accepted is on stable storage.
+    ///
+    /// # Errors
+    /// One of them failed meanwhile.
+    pub async fn stop(self) -> Result<(), CliError> {
         drop((self.environments, self.learner));
         for service in self.embedded {
-            service.stop().await;
+            service.stop().await?;
         }
+        Ok(())
     }
 
     /// Directory of reports.

@@ -46,14 +46,15 @@ impl Learned {
         let states = fit.n_states as usize;
         let pairs = states * fit.n_actions as usize;
         let array = |bytes: &Bytes, len: usize, name: &str| {
-            Packed::<f64>::new(bytes.clone()).filter(|packed| packed.len() == len).map(|packed| packed.to_vec()).ok_or_else(
-                || {
+            Packed::<f64>::new(bytes.clone())
+                .filter(|packed| packed.len() == len)
+                .map(|packed| packed.to_vec())
+                .ok_or_else(|| {
                     CliError::failure(
                         format!("expected {} bytes of {name} in the fit, got {}", len * 8, bytes.len()),
                         "check that learner and service are of one version: learner --version",
                     )
-                },
-            )
+                })
         };
         Ok(Self {
             reward: array(&fit.reward, pairs, "reward")?,
@@ -174,7 +175,8 @@ fn trace_entry(progress: &pb::FitProgress) -> TraceEntry {
 /// The command as it can be typed again.
 fn command(arguments: impl Iterator<Item = String>) -> String {
     let quoted = arguments.map(|argument| {
-        let plain = !argument.is_empty() && argument.chars().all(|c| c.is_ascii_alphanumeric() || "-_=./:,@+".contains(c));
+        let plain =
+            !argument.is_empty() && argument.chars().all(|c| c.is_ascii_alphanumeric() || "-_=./:,@+".contains(c));
         if plain { argument } else { format!("'{}'", argument.replace('\'', r"'\''")) }
     });
     std::iter::once("learner".to_owned()).chain(quoted).collect::<Vec<_>>().join(" ")

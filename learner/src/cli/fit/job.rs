@@ -1,8 +1,6 @@
 //! From flags to a job, checked without I/O: whatever can be refused before a server is asked is refused here.
 
-use super::args::{
-    BasisArg, FitArgs, HorizonPriorArg, MStepArg, PenaltyArg, PlannerArg, ResponsibilityArg,
-};
+use super::args::{BasisArg, FitArgs, HorizonPriorArg, MStepArg, PenaltyArg, PlannerArg, ResponsibilityArg};
 use crate::cli::error::CliError;
 use mazeway_client::Options;
 use mazeway_learner::irl;

@@ -72,7 +72,8 @@ async fn fit(args: &FitArgs, job: &Job, services: &Services, narrator: Narrator)
 
     let fit = learn(job, &model, &recordings, services, narrator).await?;
     let learned = assemble::Learned::new(&fit)?;
-    let policies = Policies { greedy: &learned.greedy_policy, stochastic: &learned.policy, n_actions: model.n_actions as usize };
+    let policies =
+        Policies { greedy: &learned.greedy_policy, stochastic: &learned.policy, n_actions: model.n_actions as usize };
     let judged = evaluate::judge(job, &spec, policies, expert.as_ref(), services, narrator).await?;
     narrator.step(
         "judged",
@@ -160,7 +161,10 @@ fn checked(model: &Model) -> Result<TabularMdp, CliError> {
         Some(model.initial_distribution.clone()),
     )
     .map_err(|error| {
-        CliError::failure(format!("the server's model is not one: {error}"), "check the server's version with 'server --version'")
+        CliError::failure(
+            format!("the server's model is not one: {error}"),
+            "check the server's version with 'server --version'",
+        )
     })
 }
 

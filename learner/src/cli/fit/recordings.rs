@@ -3,7 +3,11 @@
 //! Invariants: a scripted demonstration is a function of the model, the style and the settings, and its UUID a function of its
 //! content, so that a run cut off half-way is completed by the next one and never recorded twice.
 
-use super::{job::{Job, Source}, narrate::Narrator, services::Services};
+use super::{
+    job::{Job, Source},
+    narrate::Narrator,
+    services::Services,
+};
 use crate::cli::error::CliError;
 use mazeway_client::{Controller, Demonstration, Episodes, Model, Rollout};
 use mazeway_proto::learner::{Trajectory, TrajectoryFilter};
@@ -38,7 +42,11 @@ impl Expert {
 
     /// The optimal policy under a known reward; starts as the process does.
     pub fn optimal(policy: Vec<f64>, discount: f64) -> Self {
-        Self { name: format!("policy:optimal discount={discount}"), controller: Controller::Policy(policy), burn_in_steps: 0 }
+        Self {
+            name: format!("policy:optimal discount={discount}"),
+            controller: Controller::Policy(policy),
+            burn_in_steps: 0,
+        }
     }
 
     /// The source under which demonstrations with these settings are kept.
@@ -101,7 +109,10 @@ pub async fn find(
     if let Some(filter) = own {
         let found = services.count(&filter).await?;
         if let Some(recordings) = recorded(job, filter, found, style)? {
-            narrator.step("found", format_args!("{found} recordings of style '{style}'; using {}", recordings.trajectories))?;
+            narrator.step(
+                "found",
+                format_args!("{found} recordings of style '{style}'; using {}", recordings.trajectories),
+            )?;
             return Ok(recordings);
         }
         if matches!(job.source, Source::Named(_) | Source::Any) {

@@ -65,7 +65,10 @@ impl Services {
             )
         })?;
         if args.store.addr.is_some() {
-            narrator.step("connected", format_args!("learner at {learner_address}, environments at {environments_address}"))?;
+            narrator.step(
+                "connected",
+                format_args!("learner at {learner_address}, environments at {environments_address}"),
+            )?;
         }
         Ok(Self { environments, learner, data, embedded: running })
     }
@@ -151,7 +154,11 @@ impl Services {
     ///
     /// # Errors
     /// The learner refuses one or fails.
-    pub async fn record(&self, trajectories: Vec<Trajectory>, mut acknowledged: impl FnMut(u64)) -> Result<u64, CliError> {
+    pub async fn record(
+        &self,
+        trajectories: Vec<Trajectory>,
+        mut acknowledged: impl FnMut(u64),
+    ) -> Result<u64, CliError> {
         let mut recorder = self.learner.recorder();
         for trajectory in trajectories {
             recorder.record(trajectory).await?;

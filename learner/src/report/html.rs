@@ -86,9 +86,9 @@ fn lead(report: &Report) -> Vec<Value> {
         count(report.steps as f64),
         clip(&report.method, 40)
     ))];
-    if let Some(share) = report.optimal_share() {
+    if report.optimal_policy.is_some() {
         parts.push(plain("learned a reward whose greedy policy is optimal in ".into()));
-        parts.push(strong(percent(share)));
+        parts.push(strong(percent(report.agreement)));
         parts.push(plain(" of the states".into()));
         if let Some(difference) = report.expected_value_difference.filter(|x| x.is_finite()) {
             let text = format!("; acting on it gives away {} of the optimal value", super::format::brief(difference));
@@ -130,12 +130,12 @@ fn tiles(report: &Report) -> Vec<Value> {
         n => format!("after {} iterations", count(f64::from(n))),
     };
     let ended = stopped(report.stopped).split(':').next().unwrap_or_default().to_owned();
+    let (agreement, of) = match report.optimal_policy {
+        Some(_) => ("policy agreement", "of the states act optimally"),
+        None => ("action agreement", "of the demonstrated steps"),
+    };
     vec![
-        tile(
-            "action agreement",
-            percent(report.agreement),
-            held_out.unwrap_or_else(|| "of the demonstrated steps".into()),
-        ),
+        tile(agreement, percent(report.agreement), held_out.unwrap_or_else(|| of.into())),
         tile(
             "states covered",
             format!("{} of {}", count(f64::from(report.states_covered)), count(f64::from(report.n_states))),

@@ -139,9 +139,10 @@ pub struct Report {
     /// What a careful reader should know.
     pub warnings: Vec<String>,
 
-    /// Share of demonstrated steps whose action the greedy policy takes, in [0, 1].
+    /// Agreement of the greedy policy with the expert, ties split evenly, in [0, 1]: where the optimal policy is known, the
+    /// share of the states whose action is optimal; else the share of the demonstrated steps whose action it takes.
     pub agreement: f64,
-    /// The same on steps of the expert that the fit did not see.
+    /// Share of the expert's steps that the fit did not see whose action the greedy policy takes.
     pub agreement_held_out: Option<f64>,
     /// Mean log π(a|s) of the demonstrated steps, natural logarithm.
     pub log_likelihood_per_step: f64,

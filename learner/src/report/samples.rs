@@ -140,7 +140,7 @@ pub(crate) fn maze() -> Report {
     report.policy = report.greedy_policy.clone();
     report.reward = reward;
     report.state_values = values;
-    report.agreement = 0.873;
+    report.agreement = 44.0 / 57.0;
     report.expected_value_difference = Some(0.3127);
     report.true_reward = Some(true_reward);
     report.optimal_policy = Some(optimal);
@@ -199,12 +199,11 @@ pub(crate) fn highway() -> Report {
     report.state_labels = (0..s)
         .map(|i| {
             let traffic = ["clear", "passable", "boxed in"][i % 3];
-            format!("{} lane, {} m/s, {traffic}", ["right", "middle", "left"][i / 12], [20, 25, 30, 35][i / 3 % 4])
+            format!("lane {}, {} m/s, {traffic}", i / 12, [20, 25, 30, 35][i / 3 % 4])
         })
         .collect();
-    report.action_labels = (0..a)
-        .map(|i| format!("{} at {} m/s", ["keep lane", "change left", "change right"][i / 4], [20, 25, 30, 35][i % 4]))
-        .collect();
+    report.action_labels =
+        (0..a).map(|i| format!("{}, {} m/s", ["keep", "left", "right"][i / 4], [20, 25, 30, 35][i % 4])).collect();
     report.states_covered = visits.iter().filter(|&&n| n > 0.0).count() as u32;
     report.state_visits = visits;
     report.greedy_policy = greedy(&reward, a);

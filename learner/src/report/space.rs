@@ -129,13 +129,6 @@ impl Report {
         Some((0..s).map(|state| mean_reward(reward, policy, state, a)).collect())
     }
 
-    /// Share of the states whose greedy action is optimal, ties split evenly; `None` where the optimal policy is not known.
-    pub(crate) fn optimal_share(&self) -> Option<f64> {
-        let optimal = self.optimal_policy.as_ref()?;
-        let hits: f64 = self.greedy_policy.iter().zip(optimal).filter(|&(_, &best)| best > 0.0).map(|(p, _)| p).sum();
-        Some(hits / self.states().max(1) as f64)
-    }
-
     /// At most `most` states, those visited most, in order of their index, and whether that is all of them.
     pub(crate) fn leading_states(&self, most: usize) -> (Vec<usize>, bool) {
         let mut states: Vec<usize> = (0..self.states()).collect();

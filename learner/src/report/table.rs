@@ -131,13 +131,16 @@ fn drivers(report: &Report, terminal: Terminal) -> Option<String> {
 /// The fit in a glance, as names and values.
 pub(crate) fn summary_rows(report: &Report) -> Vec<(&'static str, String)> {
     let share = |part: f64, of: f64| if of > 0.0 { format!(" ({})", percent(part / of)) } else { String::new() };
-    let mut rows = vec![("action agreement", {
-        let held_out = report.agreement_held_out.map(|held_out| format!("; {} on unseen steps", percent(held_out)));
-        format!("{} of the demonstrated steps{}", percent(report.agreement), held_out.unwrap_or_default())
-    })];
-    if let Some(optimal) = report.optimal_share() {
-        rows.push(("optimal action", format!("{} of the states", percent(optimal))));
-    }
+    let held_out = report.agreement_held_out.map(percent);
+    let mut rows = if report.optimal_policy.is_some() {
+        let mut rows =
+            vec![("policy agreement", format!("{} of the states take an optimal action", percent(report.agreement)))];
+        rows.extend(held_out.map(|share| ("on unseen steps", format!("{share} of the expert's actions"))));
+        rows
+    } else {
+        let held_out = held_out.map_or_else(String::new, |share| format!("; {share} on unseen steps"));
+        vec![("action agreement", format!("{} of the demonstrated steps{held_out}", percent(report.agreement)))]
+    };
     if let Some(difference) = report.expected_value_difference {
         rows.push(("expected value difference", brief(difference)));
     }

@@ -2,14 +2,17 @@
 
 use clap::Parser as _;
 use mazeway_server::{config::Cli, serve};
-use std::{io::Write as _, process::ExitCode};
+use std::{
+    io::{self, Write as _},
+    process::ExitCode,
+};
 use tokio::net::TcpListener;
 use tracing_subscriber::EnvFilter;
 
 fn main() -> ExitCode {
     let cli = Cli::parse();
     let filter = EnvFilter::try_from_env("MAZEWAY_LOG").unwrap_or_else(|_| EnvFilter::new("warn"));
-    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
+    tracing_subscriber::fmt().with_env_filter(filter).with_writer(io::stderr).init();
     if !cli.listen.ip().is_loopback() && !cli.insecure {
         return refuse(
             2,
@@ -35,31 +38,40 @@ async fn run(cli: Cli) -> ExitCode {
             );
         }
     };
+    // Before anyone is told that the server is there, and may tell it to stop.
+    let stop = match stop_signal() {
+        Ok(stop) => stop,
+        Err(error) => return refuse(1, &format!("cannot catch signals: {error}"), "raise the limit on open files"),
+    };
     let address = listener.local_addr().unwrap_or(cli.listen);
     // Whoever started this may have closed the other end; the server serves all the same.
-    let _ = writeln!(std::io::stdout(), "listening on {address}").and_then(|()| std::io::stdout().flush());
-    match serve(cli.config, listener, stop_signal()).await {
+    let _ = writeln!(io::stdout(), "listening on {address}").and_then(|()| io::stdout().flush());
+    match serve(cli.config, listener, stop).await {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => refuse(1, &error.to_string(), "set MAZEWAY_LOG=info to see more"),
     }
 }
 
-/// SIGINT or SIGTERM.
-async fn stop_signal() {
+/// SIGINT or SIGTERM, caught from this call on.
+fn stop_signal() -> io::Result<impl Future<Output = ()>> {
     #[cfg(unix)]
     {
         use tokio::signal::unix::{SignalKind, signal};
-        let mut terminate = signal(SignalKind::terminate()).expect("a runtime with signals");
-        tokio::select! {
-            _ = tokio::signal::ctrl_c() => {}
-            _ = terminate.recv() => {}
-        }
+        let (mut interrupt, mut terminate) = (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?);
+        Ok(async move {
+            tokio::select! {
+                _ = interrupt.recv() => {}
+                _ = terminate.recv() => {}
+            }
+        })
     }
     #[cfg(not(unix))]
-    let _ = tokio::signal::ctrl_c().await;
+    Ok(async {
+        let _ = tokio::signal::ctrl_c().await;
+    })
 }
 
 fn refuse(code: u8, error: &str, hint: &str) -> ExitCode {
-    let _ = writeln!(std::io::stderr(), "error: {error}\nhint: {hint}");
+    let _ = writeln!(io::stderr(), "error: {error}\nhint: {hint}");
     ExitCode::from(code)
 }

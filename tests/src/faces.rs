@@ -117,7 +117,7 @@ pub enum Subject {
     /// Over unary calls, by session id.
     Unary(EnvironmentServiceClient<Channel>, String),
     /// Over the interactive stream.
-    Interact(VectorEnv),
+    Interact(Box<VectorEnv>),
 }
 
 impl Subject {
@@ -150,7 +150,7 @@ impl Subject {
             }
             Face::Interact => {
                 let connection = Connection::open(address).await.expect("a connection");
-                Self::Interact(Self::session(&connection, make).await)
+                Self::Interact(Box::new(Self::session(&connection, make).await))
             }
         }
     }

@@ -26,8 +26,8 @@ async fn create(service: &mut Service, request: pb::CreateSessionRequest) -> Str
     service.create_session(request).await.expect("a session").into_inner().session_id
 }
 
-fn lease(lease: Duration) -> Option<prost_types::Duration> {
-    Some(lease.try_into().expect("a lease"))
+fn duration(duration: Duration) -> prost_types::Duration {
+    duration.try_into().expect("a duration")
 }
 
 fn step(session_id: &str, actions: &[i32]) -> pb::StepRequest {
@@ -80,7 +80,7 @@ async fn every_wrong_call_names_its_field() {
     let negative = prost_types::Duration { seconds: -1, nanos: 0 };
     let wrong = pb::CreateSessionRequest { lease: Some(negative), ..maze() };
     refused(service.create_session(wrong).await, Code::InvalidArgument, "lease");
-    let wrong = pb::CreateSessionRequest { lease: lease(Duration::from_hours(100)), ..maze() };
+    let wrong = pb::CreateSessionRequest { lease: Some(duration(Duration::from_hours(100))), ..maze() };
     refused(service.create_session(wrong).await, Code::InvalidArgument, "lease");
 
     let id = create(&mut service, pb::CreateSessionRequest { num_envs: 2, ..maze() }).await;
@@ -233,7 +233,7 @@ async fn rollouts_are_limited_and_end_with_their_caller() {
 async fn an_idle_session_expires() {
     let server = EnvServer::with(Config { max_sessions: 1, ..config() });
     let mut service = service(&server).await;
-    let short = || pb::CreateSessionRequest { lease: lease(Duration::from_millis(300)), ..maze() };
+    let short = || pb::CreateSessionRequest { lease: Some(duration(Duration::from_millis(300))), ..maze() };
     let id = create(&mut service, short()).await;
     // Each use begins the lease anew.
     for seed in 0..4 {
@@ -253,7 +253,8 @@ async fn an_idle_stream_ends_with_its_session() {
     let server = EnvServer::start();
     let mut service = service(&server).await;
     let id =
-        create(&mut service, pb::CreateSessionRequest { lease: lease(Duration::from_millis(300)), ..maze() }).await;
+        create(&mut service, pb::CreateSessionRequest { lease: Some(duration(Duration::from_millis(300))), ..maze() })
+            .await;
     let (requests, mut answers) = interact(&mut service).await;
     for seed in 0..4 {
         send(&requests, Request::Reset(reset(&id, seed))).await;

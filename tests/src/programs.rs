@@ -1,0 +1,93 @@
+//! The programs `server` and `learner` as processes, built from the present sources in the tests' own profile.
+
+use std::{
+    env,
+    io::{BufRead as _, BufReader},
+    path::{Path, PathBuf},
+    process::{Child, Command, Stdio},
+    sync::OnceLock,
+};
+
+/// The path of `server` or `learner`.
+///
+/// # Panics
+/// It does not build.
+pub fn program(name: &str) -> PathBuf {
+    static DIRECTORY: OnceLock<PathBuf> = OnceLock::new();
+    let directory = DIRECTORY.get_or_init(|| {
+        let own = env::current_exe().expect("a path of this test");
+        let profile = own.ancestors().nth(2).and_then(Path::file_name).expect("a profile's directory");
+        let profile = if profile == "debug" { "dev" } else { profile.to_str().expect("a name in UTF-8") };
+        let mut cargo = Command::new(env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
+        cargo.args(["build", "--quiet", "--workspace", "--bin", "server", "--bin", "learner", "--profile", profile]);
+        cargo.args(["--message-format", "json-render-diagnostics"]).current_dir(env!("CARGO_MANIFEST_DIR"));
+        let output = cargo.stderr(Stdio::inherit()).output().expect("cargo");
+        assert!(output.status.success(), "{cargo:?}: {}", output.status);
+        String::from_utf8_lossy(&output.stdout)
+            .lines()
+            .filter_map(|line| serde_json::from_str::<serde_json::Value>(line).ok())
+            .filter_map(|message| Some(PathBuf::from(message.get("executable")?.as_str()?)))
+            .find_map(|program| Some(program.parent()?.to_path_buf()))
+            .expect("the path of a program")
+    });
+    directory.join(format!("{name}{}", env::consts::EXE_SUFFIX))
+}
+
+/// A service as a process of its own; killed when dropped.
+#[derive(Debug)]
+pub struct Service {
+    child: Child,
+    address: String,
+}
+
+impl Service {
+    /// `learner serve` on a free port over a directory.
+    pub fn learner(data: &Path) -> Self {
+        let mut command = Command::new(program("learner"));
+        command.args(["serve", "--listen", "127.0.0.1:0", "--data"]).arg(data);
+        Self::start(command)
+    }
+
+    /// `server` on a free port.
+    pub fn server() -> Self {
+        let mut command = Command::new(program("server"));
+        command.args(["--listen", "127.0.0.1:0"]);
+        Self::start(command)
+    }
+
+    /// Runs a command that says where it listens.
+    ///
+    /// # Panics
+    /// It does not.
+    pub fn start(mut command: Command) -> Self {
+        let mut child = command.stdin(Stdio::null()).stdout(Stdio::piped()).spawn().expect("a process");
+        let stdout = child.stdout.take().expect("a pipe");
+        let mut line = String::new();
+        BufReader::new(stdout).read_line(&mut line).expect("a line");
+        let address = line.trim().strip_prefix("listening on ").unwrap_or_default().to_owned();
+        assert!(!address.is_empty(), "{command:?}: expected its address, got {line:?}");
+        Self { child, address }
+    }
+
+    /// Where it listens.
+    pub fn address(&self) -> &str {
+        &self.address
+    }
+
+    /// Ends it as a power cut would: SIGKILL, no chance to tidy up.
+    ///
+    /// # Panics
+    /// It is no more.
+    pub fn kill(mut self) {
+        self.child.kill().expect("a process to kill");
+        self.child.wait().expect("a process to wait for");
+    }
+}
+
+impl Drop for Service {
+    fn drop(&mut self) {
+        // It may be dead already.
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}

@@ -1,6 +1,6 @@
 //! A real learner service in this process, and demonstrations to send it.
 
-use mazeway_client::{Learner, pack};
+use mazeway_client::{Learner, packed::pack};
 use mazeway_learner::{Config, config::Limits};
 use mazeway_proto::learner as pb;
 use std::{net::SocketAddr, path::Path, thread::JoinHandle, time::Duration};

@@ -33,6 +33,9 @@ pub struct Config {
     /// Models that are computed at a time; further callers wait.
     #[arg(long, env = "MAZEWAY_MAX_CONCURRENT_MODELS", default_value_t = 2, value_name = "N")]
     pub max_concurrent_models: usize,
+    /// Connections at a time; a further one is closed at once.
+    #[arg(long, env = "MAZEWAY_MAX_CONNECTIONS", default_value_t = 1024, value_name = "N")]
+    pub max_connections: usize,
     /// Calls and streams of one connection at a time.
     #[arg(long, env = "MAZEWAY_MAX_STREAMS_PER_CONNECTION", default_value_t = 256, value_name = "N")]
     pub max_streams_per_connection: u32,
@@ -56,6 +59,7 @@ impl Default for Config {
             max_concurrent_rollouts: 8,
             max_rollout_steps: 1_000_000_000,
             max_concurrent_models: 2,
+            max_connections: 1024,
             max_streams_per_connection: 256,
             keepalive: Duration::from_secs(10),
             shutdown_grace: Duration::from_secs(5),
@@ -91,9 +95,13 @@ pub struct Cli {
     pub config: Config,
 }
 
+/// Longest time that any setting may be.
+const LONGEST: Duration = Duration::from_hours(365 * 24);
+
 fn seconds(text: &str) -> Result<Duration, String> {
-    let positive = text.parse().ok().and_then(|secs| Duration::try_from_secs_f64(secs).ok()).filter(|d| !d.is_zero());
-    positive.ok_or_else(|| "expected a positive number of seconds".into())
+    let secs = text.parse().ok().and_then(|secs| Duration::try_from_secs_f64(secs).ok());
+    let within = secs.filter(|duration| !duration.is_zero() && *duration <= LONGEST);
+    within.ok_or_else(|| "expected a positive number of seconds, at most a year".into())
 }
 
 #[cfg(test)]
@@ -109,7 +117,7 @@ mod tests {
     #[test]
     fn seconds_are_positive() {
         assert_eq!(seconds("0.25"), Ok(Duration::from_millis(250)));
-        for wrong in ["0", "-1", "nan", "inf", "soon", ""] {
+        for wrong in ["0", "-1", "nan", "inf", "1e12", "soon", ""] {
             assert!(seconds(wrong).is_err(), "{wrong}");
         }
     }

@@ -8,6 +8,7 @@ pub mod batch;
 pub mod config;
 #[cfg(feature = "grpc")]
 mod grpc;
+pub mod raster;
 pub mod registry;
 pub mod rollout;
 pub mod sessions;

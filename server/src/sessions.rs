@@ -210,7 +210,7 @@ impl Sessions {
         let id = SessionId::random()?;
         {
             let mut inner = self.lock();
-            limit("env_id", "sessions on this server", max_sessions, inner.slots.len() + 1)?;
+            limit("sessions", "sessions on this server", max_sessions, inner.slots.len() + 1)?;
             limit(
                 "num_envs",
                 "environments on this server",

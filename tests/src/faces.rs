@@ -72,6 +72,7 @@ impl Reply {
     }
 
     /// Environment `index`'s row of everything but the final parts.
+    #[must_use]
     pub fn row(&self, index: usize) -> Self {
         let n = self.rewards.len();
         let slice = |bytes: &[u8]| bytes[index * bytes.len() / n..(index + 1) * bytes.len() / n].to_vec();

@@ -56,8 +56,8 @@ fn refused<T: std::fmt::Debug>(outcome: Result<T, Status>, code: Code, field: &s
     error.to_string()
 }
 
-fn options(name: &str, kind: prost_types::value::Kind) -> Option<prost_types::Struct> {
-    Some(prost_types::Struct { fields: [(name.to_owned(), prost_types::Value { kind: Some(kind) })].into() })
+fn option(name: &str, kind: prost_types::value::Kind) -> prost_types::Struct {
+    prost_types::Struct { fields: [(name.to_owned(), prost_types::Value { kind: Some(kind) })].into() }
 }
 
 #[tokio::test]
@@ -69,11 +69,11 @@ async fn every_wrong_call_names_its_field() {
     let wrong = pb::CreateSessionRequest { env_id: "Maze-v7".into(), ..maze() };
     let message = refused(service.create_session(wrong).await, Code::NotFound, "env_id");
     assert_eq!(message, "no environment \"Maze-v7\"; there are Highway-v0, Maze-v0");
-    let wrong = pb::CreateSessionRequest { options: options("slip", Kind::NumberValue(1.5)), ..maze() };
+    let wrong = pb::CreateSessionRequest { options: Some(option("slip", Kind::NumberValue(1.5))), ..maze() };
     refused(service.create_session(wrong).await, Code::InvalidArgument, "options.slip");
-    let wrong = pb::CreateSessionRequest { options: options("slip", Kind::NumberValue(f64::NAN)), ..maze() };
+    let wrong = pb::CreateSessionRequest { options: Some(option("slip", Kind::NumberValue(f64::NAN))), ..maze() };
     refused(service.create_session(wrong).await, Code::InvalidArgument, "options.slip");
-    let wrong = pb::CreateSessionRequest { options: options("slippery", Kind::BoolValue(true)), ..maze() };
+    let wrong = pb::CreateSessionRequest { options: Some(option("slippery", Kind::BoolValue(true))), ..maze() };
     refused(service.create_session(wrong).await, Code::InvalidArgument, "options.slippery");
     let wrong = pb::CreateSessionRequest { autoreset_mode: 9, ..maze() };
     refused(service.create_session(wrong).await, Code::InvalidArgument, "autoreset_mode");
@@ -168,8 +168,8 @@ async fn wrong_rollouts_and_models_name_their_field() {
     }
     let model = pb::GetModelRequest { env_id: "Highway-v9".into(), ..Default::default() };
     refused(service.get_model(model).await, Code::NotFound, "env_id");
-    let options = options("density", prost_types::value::Kind::StringValue("dense".into()));
-    let model = pb::GetModelRequest { env_id: "Highway-v0".into(), options };
+    let options = option("density", prost_types::value::Kind::StringValue("dense".into()));
+    let model = pb::GetModelRequest { env_id: "Highway-v0".into(), options: Some(options) };
     refused(service.get_model(model).await, Code::InvalidArgument, "options.density");
 }
 
@@ -189,12 +189,35 @@ async fn limits_are_kept() {
     let first = create(&mut service, of(50)).await;
     refused(service.create_session(of(11)).await, Code::ResourceExhausted, "num_envs");
     create(&mut service, of(10)).await;
-    refused(service.create_session(of(0)).await, Code::ResourceExhausted, "env_id");
+    refused(service.create_session(of(0)).await, Code::ResourceExhausted, "sessions");
     service.close_session(pb::CloseSessionRequest { session_id: first }).await.expect("closes");
     let id = create(&mut service, of(50)).await;
     let huge = pb::StepRequest { session_id: id, actions: vec![0; 100 << 10].into() };
     let code = service.step(huge).await.expect_err("too large a message").code();
     assert!(matches!(code, Code::OutOfRange | Code::ResourceExhausted), "{code:?}");
+}
+
+#[tokio::test]
+async fn connections_are_limited_and_come_free() {
+    let server = EnvServer::with(Config { max_connections: 2, ..config() });
+    let (first, second) = (service(&server).await, service(&server).await);
+    for mut service in [first.clone(), second.clone()] {
+        service.list_environments(pb::ListEnvironmentsRequest {}).await.expect("answers");
+    }
+    // The third is closed in its handshake, or at its first call.
+    let third = async || {
+        let mut service = EnvironmentServiceClient::new(channel(&server.address()).await?);
+        service.list_environments(pb::ListEnvironmentsRequest {}).await.map_err(ClientError::from)
+    };
+    assert!(third().await.is_err());
+    drop(first);
+    for _ in 0..500 {
+        if third().await.is_ok() {
+            return;
+        }
+        sleep(Duration::from_millis(10)).await;
+    }
+    panic!("the place of a connection that has gone stays taken");
 }
 
 #[tokio::test]

@@ -4,11 +4,13 @@ use super::status::CallError;
 use crate::{
     batch::{BatchOptions, Layout},
     config::Config,
-    grpc::from_proto::NewSession,
-    registry::{Options, Registry},
+    grpc::from_proto::{self, NewSession, RolloutLimits},
+    registry::{Environment, Options, Registry},
+    rollout::RolloutPlan,
     sessions::{Guard, SessionId, Sessions},
     sim::TabularModel,
 };
+use mazeway_proto::env as pb;
 use std::{
     sync::Arc,
     time::{Duration, Instant},
@@ -59,6 +61,21 @@ impl Host {
         let now = Instant::now();
         let (id, lease) = self.sessions.create(asked.num_envs, asked.lease, now, || environment.batch(options))?;
         Ok((self.sessions.take(id, now, None)?, lease))
+    }
+
+    /// Configures the environment of a roll-out and checks the plan.
+    pub fn plan_rollout(
+        &self,
+        mut request: pb::RolloutRequest,
+    ) -> Result<(Arc<dyn Environment>, RolloutPlan), CallError> {
+        let options = from_proto::options(request.options.take())?;
+        let environment = self.registry.configure(&request.env_id, &options)?;
+        let limits = RolloutLimits {
+            max_steps: self.config.max_rollout_steps,
+            max_message_bytes: self.config.max_message_bytes,
+        };
+        let plan = from_proto::rollout(&request, environment.spec(), &limits)?;
+        Ok((environment, plan))
     }
 
     /// Takes a session for one call.

@@ -1,9 +1,9 @@
 //! The gRPC face: decoding, calling, encoding, and nothing that computes.
 
+mod connections;
 mod from_proto;
 mod host;
 mod interact;
-mod picture;
 mod serve;
 mod service;
 mod status;

@@ -1,6 +1,6 @@
 //! A server from a listener to its shutdown.
 
-use super::{host::Host, service::EnvironmentGrpc};
+use super::{connections::at_most, host::Host, service::EnvironmentGrpc};
 use crate::config::Config;
 use mazeway_proto::env::environment_service_server::EnvironmentServiceServer;
 use std::{future::Future, sync::Arc, time::Duration};
@@ -38,6 +38,7 @@ pub async fn serve(
     // Whatever way this ends, the reaper and the streams learn of it.
     let _stop = stopping.clone().drop_guard();
     let (max_message_bytes, grace) = (config.max_message_bytes, config.shutdown_grace);
+    let max_connections = config.max_connections;
     let mut builder = Server::builder()
         .http2_keepalive_interval(Some(config.keepalive))
         .http2_keepalive_timeout(Some(PING_TIMEOUT))
@@ -62,7 +63,7 @@ pub async fn serve(
         .add_service(health_service)
         .add_service(reflection().build_v1()?)
         .add_service(reflection().build_v1alpha()?);
-    let incoming = TcpIncoming::from(listener).with_nodelay(Some(true));
+    let incoming = at_most(max_connections, TcpIncoming::from(listener).with_nodelay(Some(true)));
     let serving = router.serve_with_incoming_shutdown(incoming, stopping.clone().cancelled_owned());
     tokio::pin!(serving);
     let reaper = tokio::spawn(host.reap_sessions());

@@ -1,14 +1,16 @@
 //! `mazeway.env.v1.EnvironmentService`: each method decodes, calls and encodes.
 
 use super::{
-    from_proto::{self, RenderMode, RolloutLimits},
+    from_proto::{self, RenderMode},
     host::{Host, blocking},
     interact::{self, DrawJob, DrawSender},
-    picture,
     status::CallError,
     to_proto,
 };
-use crate::sessions::{SessionError, SessionId};
+use crate::{
+    raster::{Format, rasterise},
+    sessions::{SessionError, SessionId},
+};
 use bytes::Bytes;
 use futures_util::{Stream, StreamExt as _, stream};
 use mazeway_proto::env::{self as pb, environment_service_server::EnvironmentService};
@@ -78,14 +80,9 @@ impl EnvironmentService for EnvironmentGrpc {
     }
 
     async fn rollout(&self, request: Request<pb::RolloutRequest>) -> Result<Response<Self::RolloutStream>, Status> {
-        let (mut request, host) = (request.into_inner(), &self.0);
-        let options = from_proto::options(request.options.take())?;
-        let environment = host.registry.configure(&request.env_id, &options).map_err(CallError::from)?;
-        let limits = RolloutLimits {
-            max_steps: host.config.max_rollout_steps,
-            max_message_bytes: host.config.max_message_bytes,
-        };
-        let plan = from_proto::rollout(&request, environment.spec(), &limits)?;
+        let (request, host) = (request.into_inner(), &self.0);
+        let asked = Arc::clone(host);
+        let (environment, plan) = blocking(move || asked.plan_rollout(request)).await?;
         let permit = Arc::clone(&host.rollouts).try_acquire_owned().map_err(|_| {
             let limit = host.config.max_concurrent_rollouts as u64;
             CallError::Limit { field: "rollouts", what: "roll-outs at a time", limit, asked: limit + 1 }
@@ -140,11 +137,13 @@ async fn draw(host: &Arc<Host>, id: SessionId, index: usize, mode: RenderMode) -
 }
 
 async fn finish(drawing: String, mode: RenderMode) -> Result<pb::RenderResponse, CallError> {
-    if mode == RenderMode::Ansi {
-        return Ok(pb::RenderResponse { content: Bytes::from(drawing), width: 0, height: 0 });
-    }
+    let format = match mode {
+        RenderMode::Ansi => return Ok(pb::RenderResponse { content: Bytes::from(drawing), width: 0, height: 0 }),
+        RenderMode::RgbArray => Format::Rgb,
+        RenderMode::Png => Format::Png,
+    };
     blocking(move || {
-        let picture = picture::draw(&drawing, mode == RenderMode::Png).map_err(CallError::Internal)?;
+        let picture = rasterise(&drawing, format).map_err(|error| CallError::Internal(error.to_string()))?;
         Ok(pb::RenderResponse { content: picture.content.into(), width: picture.width, height: picture.height })
     })
     .await

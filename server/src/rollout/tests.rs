@@ -1,7 +1,7 @@
 use super::*;
 use crate::{
     batch::{Autoreset, Batch, BatchOptions, Seeds, SimBatch},
-    sim::maze,
+    sim::{highway, maze},
 };
 use proptest::prelude::*;
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -103,6 +103,44 @@ fn burn_in_is_the_head_of_a_longer_episode() {
         assert_eq!(tail.states[episode * 12..][..12], whole.states[episode * 17 + 5..][..12]);
     }
     assert_eq!(tail.final_states, whole.final_states);
+}
+
+#[test]
+fn an_episode_that_ends_in_burn_in_begins_anew() {
+    let options = serde_json::json!({"terminate_on_collision": true, "density": 8});
+    let highway = highway::configure(options.as_object().unwrap()).unwrap();
+    // Always as fast as possible in one lane: it hits before long.
+    let row = |action: usize| f64::from(u8::from(action % 12 == 3));
+    let policy = TabularPolicy::new(&(0..36 * 12).map(row).collect::<Vec<_>>(), 36, 12).unwrap();
+    let plan = RolloutPlan { burn_in_steps: 100, episodes: 20, ..plan(Controller::Policy(policy)) };
+    let mut chunks = Vec::new();
+    roll_out(&highway, &plan, &|| false, &mut |chunk| {
+        chunks.push(chunk);
+        true
+    });
+    let states: Vec<_> = chunks.iter().flat_map(|chunk| chunk.states.clone()).collect();
+    let lengths: Vec<_> = chunks.iter().flat_map(|chunk| chunk.lengths.clone()).collect();
+    let terminated: Vec<_> = chunks.iter().flat_map(|chunk| chunk.terminated.clone()).collect();
+    assert!(terminated.iter().any(|&flag| flag));
+    // A batch that resets in the step of a collision goes the same way.
+    let options =
+        BatchOptions { num_envs: 1, autoreset: Autoreset::SameStep, max_episode_steps: 0, action_masks: false };
+    let (mut at, mut restarts) = (0, 0);
+    for episode in 0..20 {
+        let mut batch = SimBatch::new(&highway, options);
+        batch.reset(Seeds::From(40 + episode as u64), None).unwrap();
+        for _ in 0..100 {
+            restarts += u32::from(batch.step(&3_i32.to_le_bytes()).unwrap().terminated()[0]);
+        }
+        for step in 0..lengths[episode] {
+            assert_eq!(batch.tabular_state(0), Ok(states[at]));
+            let ended = batch.step(&3_i32.to_le_bytes()).unwrap().terminated()[0] == 1;
+            assert_eq!(ended, terminated[episode] && step + 1 == lengths[episode]);
+            at += 1;
+        }
+        assert!(terminated[episode] || lengths[episode] == 17);
+    }
+    assert!(restarts > 20, "{restarts} restarts");
 }
 
 #[test]

@@ -42,7 +42,7 @@ fn limits_hold_before_anything_is_made() {
     create(&sessions, 1, now).unwrap();
     let third = create(&sessions, 1, now).unwrap();
     let error = sessions.create(1, None, now, never).unwrap_err();
-    assert_eq!(limit(error), ("env_id", "sessions on this server", 3, 4));
+    assert_eq!(limit(error), ("sessions", "sessions on this server", 3, 4));
     sessions.take(third, now, None).unwrap().close();
     create(&sessions, 1, now).unwrap();
 }

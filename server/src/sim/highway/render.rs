@@ -18,6 +18,8 @@ const AHEAD_M: f64 = 125.0;
 const SCALE: f64 = 7.0;
 const LANE_PX: f64 = 56.0;
 const CAR_WIDTH_PX: f64 = 18.0;
+/// How far below the middle of its lane a car is drawn.
+const LABEL_PX: f64 = 6.0;
 /// Verge above and below the lanes.
 const VERGE_PX: f64 = 26.0;
 /// Strip for the caption and the overview.
@@ -77,9 +79,9 @@ fn x_px(x_m: f64) -> f64 {
     (x_m + BEHIND_M) * SCALE
 }
 
-/// Middle of a lane.
+/// Middle of the cars of a lane, below its own to leave room for a label.
 fn lane_px(lane: usize) -> f64 {
-    VERGE_PX + ((LANES - 1 - lane) as f64 + 0.5) * LANE_PX
+    VERGE_PX + ((LANES - 1 - lane) as f64 + 0.5) * LANE_PX + LABEL_PX
 }
 
 /// An SVG document of 1190 × 306 pixels.
@@ -147,7 +149,7 @@ fn draw_road(svg: &mut String, driven_m: f64) {
     }
     for lane in 0..LANES {
         let name = ["right lane", "middle lane", "left lane"][lane];
-        text_at(svg, [8.0, lane_px(lane) + LANE_PX / 2.0 - 7.0, 11.0], "start", "#aeb4bf", name);
+        text_at(svg, [8.0, lane_px(lane) - LABEL_PX + LANE_PX / 2.0 - 7.0, 11.0], "start", "#aeb4bf", name);
     }
 }
 
@@ -156,10 +158,10 @@ fn draw_look_ahead(svg: &mut String, highway: &Highway) {
     let (name, colour) = TRAFFIC[highway.traffic()];
     let (y, start) = (lane_px(highway.road.host_lane), x_px(LENGTH_M / 2.0));
     let end = x_px(LOOK_AHEAD_M - LENGTH_M / 2.0);
-    let half = LANE_PX / 2.0 - 4.0;
-    rect(svg, [start, y - half, end - start, 2.0 * half], &format!(r#"fill="{colour}" fill-opacity="0.22""#));
-    rect(svg, [end - 2.0, y - half, 2.0, 2.0 * half], &format!(r#"fill="{colour}""#));
-    text_at(svg, [end - 8.0, y + half - 4.0, 12.0], "end", colour, &format!("{name}, {LOOK_AHEAD_M} m"));
+    let (top, height) = (y - LABEL_PX - LANE_PX / 2.0 + 3.0, LANE_PX - 6.0);
+    rect(svg, [start, top, end - start, height], &format!(r#"fill="{colour}" fill-opacity="0.22""#));
+    rect(svg, [end - 2.0, top, 2.0, height], &format!(r#"fill="{colour}""#));
+    text_at(svg, [start + 12.0, top + height - 4.0, 12.0], "start", colour, &format!("{name}, {LOOK_AHEAD_M} m"));
 }
 
 /// A car from above, driving to the right, its speed written over it.

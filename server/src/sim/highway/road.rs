@@ -37,8 +37,8 @@ pub(super) const MIN_GAP_M: f64 = 2.0;
 const FOLLOWING_GAP_M: f64 = 5.0;
 /// How fast a vehicle falls back after somebody cut in.
 const FALL_BACK_MPS: f64 = 1.0;
-/// Probability per vehicle and second of wishing to change lanes, as a fraction of 2³².
-const CHANGE_BELOW: u32 = (0.05 * 4_294_967_296.0) as u32;
+/// Probability per vehicle and second of wishing to change lanes, as a fraction of 2³¹.
+const CHANGE_BELOW: u32 = (0.05 * 2_147_483_648.0) as u32;
 /// Seconds of closing speed that a vehicle leaves the host when it cuts in ahead of it.
 const CUT_IN_SECS: f64 = 1.5;
 
@@ -159,7 +159,7 @@ impl Road {
         self.host_level = rng::below(rng, LEVELS as u32) as usize;
         self.driven_m = 0.0;
         let mut placed = 0;
-        for lane in 0..LANES {
+        for (lane, lane_speed_mps) in LANE_SPEED_MPS.into_iter().enumerate() {
             let count = (self.n + LANES - 1 - lane) / LANES;
             // In its own lane the host needs room: three quarters of the vehicles lie ahead of it, the others behind.
             let ahead = if lane == self.host_lane { (count * 3).div_ceil(4) } else { count };
@@ -172,7 +172,7 @@ impl Road {
                     self.x_m[placed] = start + place * width;
                     self.lane[placed] = lane as u8;
                     self.offset_mps[placed] = draw_offset(rng);
-                    self.speed_mps[placed] = LANE_SPEED_MPS[lane] + self.offset_mps[placed];
+                    self.speed_mps[placed] = lane_speed_mps + self.offset_mps[placed];
                     placed += 1;
                 }
             }
@@ -185,7 +185,7 @@ impl Road {
     pub(super) fn view(&self) -> View {
         let mut view =
             View { ahead_m: [f64::INFINITY; LANES], ahead_mps: [0.0; LANES], behind_m: [f64::INFINITY; LANES] };
-        for i in 0..self.n {
+        for i in 0..self.n.min(MAX_VEHICLES) {
             let lane = self.lane[i] as usize;
             if self.x_m[i] > 0.0 {
                 view.ahead_m[lane] = self.x_m[i] - LENGTH_M;
@@ -224,10 +224,14 @@ impl Road {
 
     /// Vehicles that wish to change lanes do so where the gap allows.
     fn change_lanes(&mut self, rng: &mut Rng) {
-        for i in 0..self.n {
-            let word = rng.next_u64();
-            if ((word >> 32) as u32) < CHANGE_BELOW
-                && let Some(lane) = target_lane(self.lane[i] as usize, 1 + (word & 1) as usize)
+        let n = self.n.min(MAX_VEHICLES);
+        let mut word = 0;
+        for i in 0..n {
+            // Half a word a vehicle: the low bit for the side, the others for the wish.
+            word = if i % 2 == 0 { rng.next_u64() } else { word >> 32 };
+            let half = word as u32;
+            if half >> 1 < CHANGE_BELOW
+                && let Some(lane) = target_lane(self.lane[i] as usize, 1 + (half & 1) as usize)
                 && self.gap_allows(i, lane)
             {
                 self.lane[i] = lane as u8;
@@ -261,8 +265,10 @@ impl Road {
         let mut host_after = None;
         let mut after = [0.0; MAX_VEHICLES];
         let host_lane = self.host_lane;
-        for (i, after) in after.iter_mut().enumerate().take(self.n + 1) {
-            if host_after.is_none() && (i == self.n || self.x_m[i] <= 0.0) {
+        let n = self.n.min(MAX_VEHICLES);
+        let mut i = 0;
+        loop {
+            if host_after.is_none() && (i == n || self.x_m[i] <= 0.0) {
                 let mut moved = LEVEL_SPEED_MPS[self.host_level];
                 if leader_after[host_lane] - moved <= LENGTH_M {
                     // Contact: the host gets as far as that vehicle's bumper.
@@ -273,20 +279,21 @@ impl Road {
                 leader_before[host_lane] = 0.0;
                 leader_after[host_lane] = moved;
             }
-            if i == self.n {
+            if i == n {
                 break;
             }
             let (x_m, lane) = (self.x_m[i], self.lane[i] as usize);
             let free = x_m + LANE_SPEED_MPS[lane] + self.offset_mps[i];
             let gap_m = leader_before[lane] - x_m - LENGTH_M;
             let limit = leader_after[lane] - LENGTH_M - (gap_m + FALL_BACK_MPS).min(FOLLOWING_GAP_M);
-            *after = free.min(limit).max(x_m);
-            (leader_before[lane], leader_after[lane], leader[lane]) = (x_m, *after, i);
+            after[i] = free.min(limit).max(x_m);
+            (leader_before[lane], leader_after[lane], leader[lane]) = (x_m, after[i], i);
+            i += 1;
         }
         let host_after = host_after.unwrap_or(0.0);
         self.driven_m += host_after;
         let mut events = Events::default();
-        for (i, after) in after.iter().enumerate().take(self.n) {
+        for (i, after) in after.iter().enumerate().take(n) {
             let (before, x_m, lane) = (self.x_m[i], after - host_after, self.lane[i] as usize);
             let passed = u32::from(before > 0.0 && x_m <= 0.0);
             events.overtakes_left += passed & u32::from(lane + 1 == host_lane);
@@ -326,7 +333,7 @@ impl Road {
 
     /// Insertion sort, front to back: the order changes little from one second to the next.
     fn sort(&mut self) {
-        for end in 1..self.n {
+        for end in 1..self.n.min(MAX_VEHICLES) {
             let mut at = end;
             while at > 0 && self.x_m[at - 1] < self.x_m[at] {
                 self.x_m.swap(at - 1, at);

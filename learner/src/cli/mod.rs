@@ -3,10 +3,15 @@
 //! Invariants: results go to standard output, everything else to standard error; a failure is one `error:` line and one
 //! `hint:` line; a closed pipe ends the program quietly.
 
+mod connect;
 pub mod embedded;
 pub mod error;
+mod export;
 pub mod fit;
+mod list;
 mod serve;
+mod show;
+mod table;
 
 use clap::{Args, CommandFactory as _, Parser, Subcommand};
 use directories::ProjectDirs;
@@ -26,6 +31,14 @@ struct Cli {
 enum Command {
     /// Learn a reward and a policy from demonstrations, and report what was learned
     Fit(Box<fit::FitArgs>),
+    /// List recordings, models and fits
+    List(list::ListArgs),
+    /// Show a fit, a trajectory or a model
+    Show(show::ShowArgs),
+    /// Write trajectories as JSON lines or CSV
+    Export(export::ExportArgs),
+    /// Delete trajectories or a fit
+    Delete(export::DeleteArgs),
     /// Run the learner service
     Serve(serve::ServeArgs),
 }
@@ -87,6 +100,10 @@ pub fn main() -> ExitCode {
 async fn run(command: Command) -> Result<(), CliError> {
     match command {
         Command::Fit(args) => fit::run(*args).await,
+        Command::List(args) => list::run(args).await,
+        Command::Show(args) => show::run(args).await,
+        Command::Export(args) => export::export(args).await,
+        Command::Delete(args) => export::delete(args).await,
         Command::Serve(args) => serve::run(args).await,
     }
 }

@@ -1,0 +1,41 @@
+//! A learner to ask: a running one where an address is given, else the real one on the data directory, for this command.
+
+use super::{
+    StoreArgs, data_directory,
+    embedded::{self, Embedded},
+    error::CliError,
+};
+use mazeway_client::Learner;
+
+/// A connection, and the guard of what was started for it.
+pub struct Connected {
+    /// The client.
+    pub learner: Learner,
+    embedded: Option<Embedded>,
+}
+
+/// Connects as the arguments say.
+///
+/// # Errors
+/// Nobody answers at the address; the data directory cannot be used.
+pub async fn connect(store: &StoreArgs) -> Result<Connected, CliError> {
+    if let Some(address) = &store.addr {
+        return Ok(Connected { learner: Learner::connect(address).await?, embedded: None });
+    }
+    let service = embedded::learner(&data_directory(store.data.clone())?).await?;
+    let learner = Learner::connect(&service.address()).await?;
+    Ok(Connected { learner, embedded: Some(service) })
+}
+
+impl Connected {
+    /// Ends the connection and what was started for it. `outcome` comes first where both fail.
+    pub async fn finish<T>(self, outcome: Result<T, CliError>) -> Result<T, CliError> {
+        drop(self.learner);
+        let stopped = match self.embedded {
+            Some(service) => service.stop().await,
+            None => Ok(()),
+        };
+        let value = outcome?;
+        stopped.map(|()| value)
+    }
+}

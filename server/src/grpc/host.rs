@@ -60,6 +60,7 @@ impl Host {
         }
         let now = Instant::now();
         let (id, lease) = self.sessions.create(asked.num_envs, asked.lease, now, || environment.batch(options))?;
+        tracing::debug!(session = ?id, env_id = spec.env_id, num_envs = asked.num_envs, ?lease, "session created");
         Ok((self.sessions.take(id, now, None)?, lease))
     }
 

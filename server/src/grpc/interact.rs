@@ -2,6 +2,7 @@
 //!
 //! Invariants: the batch is out of its slot for as long as the stream lives, so that no step takes a lock; dropping the
 //! stream at any point puts it back; a stream that is idle beyond the session's lease ends, and the session with it.
+//! A peer that reads no answers is not idle: its session ends with its connection, which pings watch over.
 //! Small batches are stepped where the request is read; large ones on a thread for blocking work.
 
 use super::{from_proto, host::Host, status::CallError, to_proto};

@@ -64,10 +64,10 @@ mod tests {
             let w = minimise(&counts, &counts);
             let mut sorted = counts.clone();
             sorted.sort_by(|a, b| b.total_cmp(a));
-            let multipliers = (1..=sorted.len()).map(|m| {
+            let mut multipliers = (1..=sorted.len()).map(|m| {
                 (m, (m as f64 - 1.0) / sorted[..m].iter().map(|c| 1.0 / c).sum::<f64>())
             });
-            let (_, multiplier) = multipliers.filter(|&(m, l)| sorted[m - 1] > l).next_back().expect("the first always counts");
+            let (_, multiplier) = multipliers.rfind(|&(m, l)| sorted[m - 1] > l).expect("the first always counts");
             for (w, c) in w.iter().zip(&counts) {
                 prop_assert!((w - (1.0 - multiplier / c).max(0.0)).abs() < 1e-9);
             }

@@ -77,7 +77,7 @@ impl Method for Em {
         if options.responsibility == Responsibility::Exact && kept < LOST {
             warnings.push(format!(
                 "the exact product of rewards over {} trajectories keeps a share of {kept:.1e} of the data: the weights \
-                 follow 1/counts and not the demonstrations",
+                 follow 1/counts (all is on what was never demonstrated, where there is any) and not the demonstrations",
                 problem.statistics.n_trajectories()
             ));
         }

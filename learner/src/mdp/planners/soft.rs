@@ -11,7 +11,8 @@ use crate::mdp::{Policy, TabularMdp};
 
 const MAX_STEPS: u32 = 200;
 /// Wanted |V − log Σ exp Q|, relative to the largest value.
-const RELATIVE_TOLERANCE: f64 = 1e-13;
+/// Little above rounding: the error of the values is up to 1/(1 − γ) times this.
+const RELATIVE_TOLERANCE: f64 = 2e-15;
 
 /// Solves for soft values again and again as the reward moves.
 pub struct SoftSolver<'a> {
@@ -70,7 +71,9 @@ impl<'a> SoftSolver<'a> {
             }
             last = size;
             self.iterations += 1;
-            let step = Resolvent::new(self.mdp, &self.policy, self.discount).solve(&residual);
+            // far from the solution Newton's step is itself rough: its error is corrected by the next
+            let rough = (1e-3 * size / scale).clamp(1e-8, 1e-4);
+            let step = Resolvent::new(self.mdp, &self.policy, self.discount).solve_roughly(&residual, rough);
             for (v, d) in self.state_values.iter_mut().zip(step) {
                 *v += d;
             }

@@ -119,6 +119,9 @@ pub fn report(parts: Parts<'_>) -> Result<Report, CliError> {
         }
         None => (fit.agreement, None),
     };
+    // Where several actions are optimal, the expert takes one of them and the greedy policy a part of each: their steps do not
+    // tell how well it does, the states do.
+    let agreement_held_out = judged.agreement.filter(|_| truth.is_none());
     let (true_reward, optimal_policy) = truth.map(|truth| (truth.reward, truth.optimal_policy)).unzip();
     Ok(Report {
         env_id: job.env_id.clone(),
@@ -149,7 +152,7 @@ pub fn report(parts: Parts<'_>) -> Result<Report, CliError> {
         total_secs: begun.elapsed().as_secs_f64(),
         warnings: fit.warnings,
         agreement,
-        agreement_held_out: judged.agreement,
+        agreement_held_out,
         log_likelihood_per_step: fit.log_likelihood_per_step,
         log_likelihood_per_step_held_out: judged.log_likelihood_per_step,
         drivers: judged.drivers,

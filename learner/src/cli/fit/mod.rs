@@ -35,6 +35,11 @@ use std::{path::Path, time::Instant};
 pub async fn run(args: FitArgs) -> Result<(), CliError> {
     let job = Job::new(&args)?;
     let narrator = Narrator::new(args.json);
+    if let Some(out) = &args.out {
+        // A report that cannot be written is better known before the work than after it.
+        std::fs::create_dir_all(out)
+            .map_err(|error| cannot_write(format!("cannot make {}: {error}", out.display())))?;
+    }
     let services = Services::start(&args, narrator).await?;
     let outcome = tokio::select! {
         outcome = fit(&args, &job, &services, narrator) => outcome,
@@ -57,7 +62,7 @@ async fn fit(args: &FitArgs, job: &Job, services: &Services, narrator: Narrator)
     };
 
     let spinner = narrator.spinner("model");
-    let model = services.model(job).await?;
+    let model = services.model(job, &spec).await?;
     services.put_model(&model).await?;
     spinner.finish_and_clear();
     narrator.step("model", describe(&model))?;
@@ -68,7 +73,7 @@ async fn fit(args: &FitArgs, job: &Job, services: &Services, narrator: Narrator)
         Some(truth) => Some(Expert::optimal(truth.optimal_policy.clone(), job.discount())),
         None => spec.drivers.iter().any(|(name, _)| *name == style && name != "random").then(|| Expert::driver(&style)),
     };
-    let recordings = recordings::find(job, &style, &model, expert.as_ref(), services, narrator).await?;
+    let recordings = recordings::find(job, &style, &spec, &model, expert.as_ref(), services, narrator).await?;
 
     let fit = learn(job, &model, &recordings, services, narrator).await?;
     let learned = assemble::Learned::new(&fit)?;
@@ -182,9 +187,7 @@ fn describe(model: &Model) -> String {
 
 /// Prints the tables or the object, and where the report is.
 fn show(report: &report::Report, out: &Path, json: bool, narrator: Narrator) -> Result<(), CliError> {
-    let fail = |error: report::ReportError| {
-        CliError::failure(error.to_string(), "choose a directory that you may write to with --out DIR")
-    };
+    let fail = |error: report::ReportError| cannot_write(error.to_string());
     let written = write::write(report, out).map_err(fail)?;
     if json {
         let mut object = json::to_string(report, Some(&written.html));
@@ -198,6 +201,10 @@ fn show(report: &report::Report, out: &Path, json: bool, narrator: Narrator) -> 
         narrator.step("picture", picture.display())?;
     }
     Ok(())
+}
+
+fn cannot_write(message: String) -> CliError {
+    CliError::failure(message, "choose a directory that you may write to with --out DIR")
 }
 
 /// A directory's name from names that may hold anything.

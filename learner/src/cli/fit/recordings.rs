@@ -9,7 +9,7 @@ use super::{
     services::Services,
 };
 use crate::cli::error::CliError;
-use mazeway_client::{Controller, Demonstration, Episodes, Model, Rollout};
+use mazeway_client::{Controller, Demonstration, EnvSpec, Episodes, Model, Rollout};
 use mazeway_proto::learner::{Trajectory, TrajectoryFilter};
 use uuid::Uuid;
 
@@ -88,6 +88,7 @@ fn unscripted(filter: &TrajectoryFilter) -> TrajectoryFilter {
 pub async fn find(
     job: &Job,
     style: &str,
+    spec: &EnvSpec,
     model: &Model,
     expert: Option<&Expert>,
     services: &Services,
@@ -119,7 +120,12 @@ pub async fn find(
             return Err(nothing_recorded(job, style));
         }
     }
-    let expert = expert.ok_or_else(|| nothing_recorded(job, style))?;
+    let Some(expert) = expert else {
+        return Err(CliError::failure(
+            format!("nothing is recorded for {} under style '{style}', and no scripted expert drives so", job.env_id),
+            format!("record it first (see the README), or choose a style with an expert: {}", spec.styles.join(", ")),
+        ));
+    };
     demonstrated(job, style, model, expert, services, narrator).await
 }
 

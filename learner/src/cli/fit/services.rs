@@ -112,8 +112,18 @@ impl Services {
     ///
     /// # Errors
     /// Wrong options; the server fails.
-    pub async fn model(&self, job: &Job) -> Result<Model, CliError> {
-        Ok(self.environments.model(&job.env_id, &job.env_options).await?)
+    pub async fn model(&self, job: &Job, spec: &EnvSpec) -> Result<Model, CliError> {
+        self.environments.model(&job.env_id, &job.env_options).await.map_err(|error| {
+            if !error.field().is_some_and(|field| field.starts_with("options")) {
+                return error.into();
+            }
+            let known: Vec<_> =
+                spec.options.iter().map(|option| format!("{}={}", option.name, option.default)).collect();
+            CliError::usage(
+                format!("wrong --env-option: {error}"),
+                format!("{} takes, with their defaults: {}", spec.env_id, known.join(", ")),
+            )
+        })
     }
 
     /// Keeps a model in the learner.
@@ -172,7 +182,12 @@ impl Services {
     /// # Errors
     /// The learner refuses or fails.
     pub async fn fit(&self, request: FitRequest, progress: impl FnMut(&FitProgress)) -> Result<Fit, CliError> {
-        Ok(self.learner.fit(request, progress).await?)
+        self.learner.fit(request, progress).await.map_err(|error| match error.field() {
+            Some(field) if field.starts_with("options") => {
+                CliError::usage(error.to_string(), "see 'learner fit --help' for what each option takes")
+            }
+            _ => error.into(),
+        })
     }
 
     /// Where the recordings that a fit used came from, and how many from each.

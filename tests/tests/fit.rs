@@ -153,19 +153,18 @@ fn the_maze_is_learned_and_drawn() {
 #[test]
 fn every_option_of_the_paper_s_algorithm_runs() {
     let data = tempfile::tempdir().expect("a directory");
-    for options in [
-        ["--m-step", "simplex", "--horizon-prior", "uniform", "--planner", "policy-iteration"],
-        ["--m-step", "nnls", "--horizon-prior", "geometric", "--planner", "expectation-maximization"],
-        ["--responsibility", "exact", "--basis", "state-action", "--planner", "soft-value-iteration"],
-    ] {
-        let arguments =
-            [&["--env", "Maze-v0", "--method", "em", "--trajectories", "20", "--json"], &options[..]].concat();
-        let result = object(&fit(data.path(), &arguments));
-        assert!(result["agreement"].as_f64().is_some_and(|share| share > 0.2), "{options:?}: {result}");
-    }
+    let fitted = |options: &[&str]| {
+        let arguments = [&["--env", "Maze-v0", "--method", "em", "--trajectories", "20", "--json"], options].concat();
+        object(&fit(data.path(), &arguments))["agreement"].as_f64().expect("a number")
+    };
+    let nnls = fitted(&["--m-step", "nnls", "--horizon-prior", "geometric", "--planner", "expectation-maximization"]);
+    let simplex = fitted(&["--m-step", "simplex", "--horizon-prior", "uniform", "--planner", "policy-iteration"]);
+    assert!(nnls > 0.4 && simplex > 0.2, "{nnls} {simplex}");
+    let exact = ["--responsibility", "exact", "--basis", "state-action", "--planner", "soft-value-iteration"];
+    assert!(fitted(&exact) < nnls, "the exact product loses its data");
     let text = fit(data.path(), &["--env", "Maze-v0", "--method", "em", "--responsibility", "exact"]);
     let text = String::from_utf8_lossy(&text.stdout).into_owned();
-    assert!(text.contains("warning:"), "the exact product loses its data, and says so: {text}");
+    assert!(text.contains("warning:"), "and says so: {text}");
 }
 
 #[test]

@@ -49,6 +49,14 @@ class Process:
         self.stop()
         pytest.fail(f"no address line; stdout: {seen!r}, stderr: {self.log.read_text()}")
 
+    def pause(self):
+        """Stops the process in its tracks and waits until it stands still."""
+        self.popen.send_signal(signal.SIGSTOP)
+        os.waitid(os.P_PID, self.popen.pid, os.WSTOPPED | os.WNOWAIT)
+
+    def resume(self):
+        self.popen.send_signal(signal.SIGCONT)
+
     def stop(self, how=signal.SIGKILL):
         if self.popen.poll() is None:
             self.popen.send_signal(how)

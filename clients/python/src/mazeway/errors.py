@@ -145,6 +145,7 @@ def from_rpc_error(error: grpc.RpcError, *, address: str, start: str) -> Mazeway
     if kind is InvalidArgumentError:
         violations = _violations(error)
         field = violations[0][0] if violations else ""
-        missing = [f"{f}: {d}" for f, d in violations if d not in details]
-        return InvalidArgumentError("; ".join([details, *missing]), field=field)
+        named = details if field.rpartition(".")[2] in details else f"{field}: {details}"
+        further = [f"{f}: {d}" for f, d in violations[1:]]
+        return InvalidArgumentError("; ".join([named, *further]), field=field)
     return kind(details)

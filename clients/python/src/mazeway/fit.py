@@ -63,6 +63,11 @@ class Fit:
         self.steps: int = message.steps
         #: Weights of the basis functions, shape (n_basis,).
         self.weights: Floats = array("weights", (-1,))
+        #: Their standard errors, shape (n_basis,), NaN where not determined; None unless the fit is an
+        #: unpenalised maximum of the likelihood.
+        self.standard_errors: Floats | None = (
+            array("standard_errors", self.weights.shape) if message.standard_errors else None
+        )
         #: R(s,a), shape (n_states, n_actions).
         self.reward: Floats = array("reward", pairs)
         #: pi(a|s) that explains the demonstrations, shape (n_states, n_actions).

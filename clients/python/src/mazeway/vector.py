@@ -175,7 +175,8 @@ class MazewayVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
 
     def close_extras(self, **_kwargs: Any) -> None:
         """Ends the session on the server."""
-        self._session.close()
+        if hasattr(self, "_session"):  # Gymnasium 1.0 closes what failed to be made, too
+            self._session.close()
 
     def _reset(self, seed: int | None, seeds: npt.NDArray[Any] | None, mask: Flags | None) -> Any:
         return self._session.reset(

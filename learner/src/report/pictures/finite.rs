@@ -132,11 +132,13 @@ fn pairs(
 ) -> Result<Picture, ReportError> {
     let size = (WIDTH, TITLE + layout.names + layout.height() + BAR);
     let note = layout.note(report, what, true);
-    let (factor, unit) = unit(values);
+    // Probabilities keep their own scale, from 0 to 1.
+    let probabilities = name == "policy_table";
+    let (factor, unit) = if probabilities { (1.0, String::new()) } else { unit(values) };
     let values: Vec<f64> = values.iter().map(|value| value / factor).collect();
     let svg = Canvas::draw(name, size, &format!("{heading}: {note}"), |canvas| {
         title(canvas, MARGIN, 0.0, WIDTH - 2.0 * MARGIN, heading, &note);
-        let scale = Scale::from_zero(if name == "policy_table" { vec![1.0] } else { values.clone() });
+        let scale = Scale::from_zero(if probabilities { vec![1.0] } else { values.clone() });
         let (left, top) = (layout.left, TITLE + layout.names);
         for (j, &action) in layout.actions.iter().enumerate() {
             let (x, text) = (left + (j as f64 + 0.5) * layout.column, report.action_name(action, 22));

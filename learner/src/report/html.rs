@@ -6,7 +6,7 @@
 use super::format::{METRICS, MISSING, alike, clip, count, duration, interval_parts, options, percent, stopped};
 use super::pictures::{self, Picture};
 use super::space::{LANES, SPEEDS_MPS, TRAFFIC};
-use super::table::{highway_choice, summary_rows};
+use super::table::{difference_text, highway_choice, summary_rows};
 use super::{DriverMetrics, Interval, Report, ReportError};
 use base64::Engine as _;
 use minijinja::{Environment, Value, context};
@@ -63,12 +63,16 @@ fn heading(report: &Report) -> String {
 }
 
 fn recordings(report: &Report) -> String {
-    let sources: Vec<String> = report
-        .sources
-        .iter()
-        .map(|source| format!("{} from {}", count(source.trajectories as f64), clip(&source.name, 80)))
-        .collect();
-    let from = if sources.is_empty() { String::new() } else { format!(": {}", sources.join(", ")) };
+    let from = match report.sources.as_slice() {
+        [] => String::new(),
+        [source] => format!(", from {}", clip(&source.name, 80)),
+        many => {
+            let part = |source: &super::Source| {
+                format!("{} from {}", count(source.trajectories as f64), clip(&source.name, 80))
+            };
+            format!(": {}", many.iter().map(part).collect::<Vec<_>>().join(", "))
+        }
+    };
     format!("{} of at most {} steps{from}", count(report.trajectories as f64), count(f64::from(report.horizon)))
 }
 
@@ -91,7 +95,10 @@ fn lead(report: &Report) -> Vec<Value> {
         parts.push(strong(percent(report.agreement)));
         parts.push(plain(" of the states".into()));
         if let Some(difference) = report.expected_value_difference.filter(|x| x.is_finite()) {
-            let text = format!("; acting on it gives away {} of the optimal value", super::format::brief(difference));
+            let text = match difference_text(difference).as_str() {
+                "0" => "; acting on it loses nothing against the optimal policy".to_owned(),
+                lost => format!("; acting on it gives away {lost} of the optimal value"),
+            };
             parts.push(plain(text));
         }
         parts.push(plain(".".into()));
@@ -131,11 +138,11 @@ fn tiles(report: &Report) -> Vec<Value> {
     };
     let ended = stopped(report.stopped).split(':').next().unwrap_or_default().to_owned();
     let (agreement, of) = match report.optimal_policy {
-        Some(_) => ("policy agreement", "of the states act optimally"),
-        None => ("action agreement", "of the demonstrated steps"),
+        Some(_) => ("policy agreement", "of the states act optimally".to_owned()),
+        None => ("action agreement", held_out.unwrap_or_else(|| "of the demonstrated steps".into())),
     };
     vec![
-        tile(agreement, percent(report.agreement), held_out.unwrap_or_else(|| of.into())),
+        tile(agreement, percent(report.agreement), of),
         tile(
             "states covered",
             format!("{} of {}", count(f64::from(report.states_covered)), count(f64::from(report.n_states))),

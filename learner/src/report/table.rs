@@ -11,9 +11,6 @@ use std::io::IsTerminal;
 
 /// States listed where the environment has no layout that is known here.
 const MOST_STATES: usize = 40;
-/// Width at which the highway's states stand three to a line.
-const WIDE: usize = 108;
-
 const RULE: LineStyle = LineStyle::none().fill('─').junction('─');
 const STYLE: TableStyle = TableStyle::new().top_border(RULE).header_separator(RULE).bottom_border(RULE);
 
@@ -128,6 +125,11 @@ fn drivers(report: &Report, terminal: Terminal) -> Option<String> {
     ))
 }
 
+/// An expected value difference; what rounding leaves of none is none.
+pub(crate) fn difference_text(difference: f64) -> String {
+    if difference.abs() < 1e-9 { "0".to_owned() } else { brief(difference) }
+}
+
 /// The fit in a glance, as names and values.
 pub(crate) fn summary_rows(report: &Report) -> Vec<(&'static str, String)> {
     let share = |part: f64, of: f64| if of > 0.0 { format!(" ({})", percent(part / of)) } else { String::new() };
@@ -135,14 +137,16 @@ pub(crate) fn summary_rows(report: &Report) -> Vec<(&'static str, String)> {
     let mut rows = if report.optimal_policy.is_some() {
         let mut rows =
             vec![("policy agreement", format!("{} of the states take an optimal action", percent(report.agreement)))];
-        rows.extend(held_out.map(|share| ("on unseen steps", format!("{share} of the expert's actions"))));
+        rows.extend(
+            held_out.map(|share| ("on unseen steps", format!("{share} of the expert's actions, ties counted in part"))),
+        );
         rows
     } else {
         let held_out = held_out.map_or_else(String::new, |share| format!("; {share} on unseen steps"));
         vec![("action agreement", format!("{} of the demonstrated steps{held_out}", percent(report.agreement)))]
     };
     if let Some(difference) = report.expected_value_difference {
-        rows.push(("expected value difference", brief(difference)));
+        rows.push(("expected value difference", difference_text(difference)));
     }
     rows.push(("log-likelihood", {
         let held_out =
@@ -217,8 +221,18 @@ fn ties(choices: &[(usize, f64)]) -> String {
 
 /// The 36 states, by lane and speed, three kinds of traffic to a line where there is room.
 fn highway(report: &Report, terminal: Terminal) -> String {
-    let wide = terminal.width >= WIDE;
+    let plain = highway_table(report, Terminal { colour: false, ..terminal }, true).trim_fmt();
+    let wide = plain.lines().all(|line| line.chars().count() <= terminal.width);
+    let table = highway_table(report, terminal, wide).trim_fmt();
+    let note = "action: lane change and speed in m/s; no visits: not seen by the learner";
+    format!("{}\n{}\n{table}", terminal.heading("Learned policy and reward"), terminal.dim(note))
+}
+
+fn highway_table(report: &Report, terminal: Terminal, wide: bool) -> Table {
     let mut table = terminal.table();
+    if wide {
+        table.set_content_arrangement(ContentArrangement::Disabled);
+    }
     let fields = ["action", "reward", "value", "visits"];
     if wide {
         let names = TRAFFIC.iter().flat_map(|traffic| fields.iter().map(move |field| (traffic, field)));
@@ -259,8 +273,13 @@ fn highway(report: &Report, terminal: Terminal) -> String {
         }
     }
     right_align(&mut table, if wide { vec![1, 3, 4, 5, 7, 8, 9, 11, 12, 13] } else { vec![1, 4, 5, 6] });
-    let note = "action: lane change and speed in m/s; no visits: not seen by the learner";
-    format!("{}\n{}\n{}", terminal.heading("Learned policy and reward"), terminal.dim(note), table.trim_fmt())
+    if wide {
+        // Three tables stand side by side: narrow gaps within each, wide ones between.
+        for (i, column) in table.column_iter_mut().enumerate() {
+            column.set_padding((if matches!(i, 2 | 6 | 10) { 2 } else { 0 }, 0));
+        }
+    }
+    table
 }
 
 /// One character for what a policy does in a state of a grid.

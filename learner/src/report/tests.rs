@@ -127,7 +127,13 @@ fn the_terminal_shows_the_highway() {
         assert!(shown.contains(part), "{part:?} in\n{shown}");
     }
     // One line for every lane and speed where there is room, one for every state where there is not.
-    assert_eq!(shown.lines().filter(|line| line.contains("keep 35")).count(), 12);
+    for width in [108, 120, 132] {
+        let shown = text(&samples::highway(), width);
+        let states = shown
+            .lines()
+            .filter(|line| line.contains("keep 35") && line.contains("right 35") | line.contains("left 35"));
+        assert_eq!(states.count(), 12, "at {width}:\n{shown}");
+    }
     let narrow = text(&samples::highway(), 80);
     assert_eq!(narrow.lines().filter(|line| line.contains("boxed in")).count(), 12);
 }

@@ -2,7 +2,7 @@
 
 use super::canvas::{Canvas, Type, fit};
 use super::colour::{INK, MUTED, RULE, Scale};
-use crate::report::format::alike;
+use crate::report::format::{alike, count};
 
 /// Width of a single picture.
 pub(super) const WIDTH: f64 = 400.0;
@@ -30,7 +30,8 @@ pub(super) fn bar(canvas: &Canvas<'_>, x: f64, y: f64, width: f64, scale: &Scale
         canvas.rect(x + left, y + 8.0, length - left, 9.0, scale.at(f64::from(i) / f64::from(steps - 1)));
     }
     canvas.outline(x, y + 8.0, length, 9.0, RULE, 0.7);
-    let write = alike([scale.low, scale.high]);
+    let alike = alike([scale.low, scale.high]);
+    let write = |value: f64| if value.fract() == 0.0 { count(value) } else { alike(value) };
     let set = Type::new(11.0).colour(MUTED);
     canvas.text(x, y + 27.0, &write(scale.low), set);
     canvas.text(x + length / 2.0, y + 27.0, &fit(name, 11.0, length - 70.0), set.colour(INK).centred());

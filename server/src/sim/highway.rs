@@ -3,12 +3,14 @@
 //! Lane 0 is the right (slow) lane, 2 the left (fast) one; one decision a second. Action = 4 × lane change + speed level, lane
 //! change 0 keep, 1 left, 2 right; levels 0..3 are 20, 25, 30 and 35 m/s. A change needs a free gap alongside, else the host
 //! keeps its lane and takes the speed. Tabular state = (lane × 4 + level) × 3 + traffic, traffic 0 *clear* (own lane free for
-//! 45 m), 1 *passable* (own lane blocked, an adjacent lane free), 2 *boxed in* (own lane blocked, no adjacent lane free).
+//! 45 m, from centre to centre), 1 *passable* (own lane blocked, an adjacent lane free), 2 *boxed in* (own lane blocked, no
+//! adjacent lane free).
 //!
 //! Step rewards, from the speed v after the step, the collisions c and the overtakes from the right o of the step:
 //! `aggressive` (v − 20) / 15 − 5 c; `bad` c; `legal` (v − 20) / 15 − 5 c − 5 o.
 //!
-//! Invariants: a step neither allocates nor draws more or fewer random words than the traffic needs, whoever drives.
+//! Overtakes count vehicles of the lane next to the host's: passed from the left in the lane to its right, from the right in
+//! the lane to its left. Invariants: a step does not allocate; style and observation never change what happens on the road.
 
 mod drivers;
 mod estimate;

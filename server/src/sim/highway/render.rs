@@ -219,7 +219,7 @@ fn draw_caption(svg: &mut String, highway: &Highway) {
     let shown = [place(-BEHIND_M), map_top, place(AHEAD_M) - place(-BEHIND_M), 3.0 * map_lane];
     rect(svg, shown, r##"fill="#ffffff" fill-opacity="0.08""##);
     let mut dot = |x_m: f64, lane: usize, colour: &str| {
-        if (REAR_M..=FRONT_M).contains(&x_m) {
+        if (REAR_M + LENGTH_M..=FRONT_M - LENGTH_M).contains(&x_m) {
             let y = map_top + (LANES - 1 - lane) as f64 * map_lane + 2.5;
             rect(svg, [place(x_m) - 8.0, y, 16.0, 5.0], &format!(r#"rx="2" fill="{colour}""#));
         }

@@ -155,7 +155,7 @@ impl ExpectedValueDifference {
 /// `horizon` is looked at only where the discount is 1.
 ///
 /// # Errors
-/// As [`plan`](crate::mdp::plan).
+/// As [`plan`].
 pub fn expected_value_difference(
     mdp: &TabularMdp,
     true_reward: &[f64],

@@ -347,7 +347,7 @@ def test_recorder_refuses_what_is_not_discrete(learner_address):
 def test_recorder_sends_again_after_a_failure(tmp_path, style):
     """The learner is killed with an episode unacknowledged: nothing is lost, nothing is twice."""
     process = start_learner(tmp_path)
-    env = record_lake(process.address, style, timeout=1.0)
+    env = record_lake(process.address, style, timeout=3.0)
     env.reset(seed=1)
     while not any(env.step(1)[2:4]):
         pass

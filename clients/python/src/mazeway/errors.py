@@ -7,6 +7,8 @@ argument is also a `ValueError`, an absent server also a `ConnectionError`.
 from __future__ import annotations
 
 import grpc
+from typing import Any
+
 import gymnasium
 
 from mazeway import _wire
@@ -106,7 +108,8 @@ _BY_CODE: dict[grpc.StatusCode, type[MazewayError]] = {
 
 def _violations(error: grpc.RpcError) -> list[tuple[str, str]]:
     """Field and description of each google.rpc.BadRequest violation in the trailers."""
-    for key, value in error.trailing_metadata() or ():
+    metadata: Any = error.trailing_metadata() or ()
+    for key, value in metadata:
         if key == "grpc-status-details-bin":
             return [
                 (violation.field, violation.description)

@@ -73,7 +73,8 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordCons
             timeout=timeout,
         )
         gymnasium.Wrapper.__init__(self, env)
-        observations, actions = env.observation_space, env.action_space
+        observations: Any = env.observation_space
+        actions: Any = env.action_space
         for name, space in (("observation", observations), ("action", actions)):
             if not isinstance(space, gymnasium.spaces.Discrete):
                 raise InvalidArgumentError(

@@ -6,9 +6,9 @@ argument is also a `ValueError`, an absent server also a `ConnectionError`.
 
 from __future__ import annotations
 
-import grpc
 from typing import Any
 
+import grpc
 import gymnasium
 
 from mazeway import _wire

@@ -1,0 +1,543 @@
+//! The learner service over real sockets: what it answers to right and to wrong calls.
+
+use mazeway_client::{
+    ClientError, Code, Demonstration, Learner, Model, Options, Recorder, packed::Packed, packed::pack,
+};
+use mazeway_learner::config::Limits;
+use mazeway_proto::{
+    env::{ModelPart, model_part::Part},
+    learner::{self as pb, fit_response::Event, learner_service_client::LearnerServiceClient},
+};
+use mazeway_tests::{
+    EnvServer,
+    learner::{LearnerServer, export, trajectory},
+};
+use serde_json::Value;
+use std::{path::Path, time::Duration};
+use tempfile::TempDir;
+use tokio::time::timeout;
+use tonic::{Status, transport::Channel};
+use uuid::Uuid;
+
+/// Time within which anything here ends, unless it hangs.
+const PATIENCE: Duration = Duration::from_secs(60);
+
+fn start() -> (TempDir, LearnerServer) {
+    let data = tempfile::tempdir().expect("a directory");
+    let server = LearnerServer::start(data.path());
+    (data, server)
+}
+
+/// The generated client, for calls that the real client would not make.
+async fn raw(server: &LearnerServer) -> LearnerServiceClient<Channel> {
+    let channel = mazeway_client::channel(&server.address()).await.expect("a learner that answers");
+    LearnerServiceClient::new(channel).max_encoding_message_size(usize::MAX)
+}
+
+/// Sends requests on one stream and collects the answers, and how the stream ended.
+async fn record(
+    server: &LearnerServer,
+    requests: Vec<Vec<pb::Trajectory>>,
+) -> (Vec<pb::RecordTrajectoriesResponse>, Result<(), Status>) {
+    let requests = requests.into_iter().map(|trajectories| pb::RecordTrajectoriesRequest { trajectories });
+    let stream = raw(server).await.record_trajectories(tokio_stream::iter(requests.collect::<Vec<_>>())).await;
+    let mut answers = match stream {
+        Ok(answers) => answers.into_inner(),
+        Err(status) => return (Vec::new(), Err(status)),
+    };
+    let mut all = Vec::new();
+    loop {
+        match timeout(PATIENCE, answers.message()).await.expect("an answer") {
+            Ok(Some(answer)) => all.push(answer),
+            Ok(None) => return (all, Ok(())),
+            Err(status) => return (all, Err(status)),
+        }
+    }
+}
+
+fn blamed(status: Status) -> (Code, String) {
+    let error = ClientError::from(status);
+    (error.code(), error.field().unwrap_or_default().to_owned())
+}
+
+fn blame(error: &ClientError) -> (Code, String) {
+    (error.code(), error.field().unwrap_or_default().to_owned())
+}
+
+async fn maze() -> Model {
+    let server = EnvServer::start();
+    let model = mazeway_client::model(&server.address(), "Maze-v0", &Options::default()).await.expect("a model");
+    tokio::task::spawn_blocking(move || server.stop()).await.expect("a stop");
+    model
+}
+
+fn reference(name: &str) -> Value {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("data").join(name);
+    serde_json::from_str(&std::fs::read_to_string(path).expect("a file")).expect("JSON")
+}
+
+fn demonstrations(model_id: &str) -> Vec<Demonstration> {
+    let file = reference("maze_demonstrations.json");
+    let rows = |name: &str| file[name].as_array().expect("rows").clone();
+    let numbers =
+        |row: &Value| row.as_array().expect("a row").iter().map(|v| v.as_u64().expect("a number") as u32).collect();
+    let all = rows("states").into_iter().zip(rows("actions"));
+    all.map(|(states, actions)| Demonstration {
+        env_id: "Maze-v0".into(),
+        model_id: model_id.into(),
+        style: "goals".into(),
+        source: "maze_demonstrations.json".into(),
+        n_states: 57,
+        n_actions: 4,
+        states: numbers(&states),
+        actions: numbers(&actions),
+        ..Demonstration::default()
+    })
+    .collect()
+}
+
+/// A learner that knows the maze and its demonstrations.
+async fn with_demonstrations(server: &LearnerServer) -> (Learner, Model) {
+    let learner = server.client().await;
+    let model = maze().await;
+    learner.put_model(&model).await.expect("a model");
+    let mut recorder = learner.recorder();
+    for demonstration in demonstrations(&model.model_id) {
+        recorder.record(demonstration).await.expect("a demonstration");
+    }
+    let receipt = recorder.finish().await.expect("everything stored");
+    assert_eq!((receipt.stored, receipt.duplicates), (20, 0));
+    (learner, model)
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn every_request_is_answered_in_order_and_read_back_byte_for_byte() {
+    let (_data, server) = start();
+    let requests = (0..40_u128).map(|i| (i * 10..i * 10 + 10).map(trajectory).collect::<Vec<_>>()).collect::<Vec<_>>();
+    let (answers, end) = record(&server, requests.clone()).await;
+    end.expect("a stream that ends well");
+    assert_eq!(answers.len(), requests.len());
+    for (answer, request) in answers.iter().zip(&requests) {
+        assert!(answer.trajectory_ids.iter().eq(request.iter().map(|t| &t.trajectory_id)));
+        assert_eq!(answer.stored, 10);
+    }
+    // A second time: acknowledged, not stored.
+    let (again, end) = record(&server, requests.clone()).await;
+    end.expect("a stream that ends well");
+    assert!(again.iter().all(|answer| answer.stored == 0 && answer.trajectory_ids.len() == 10));
+    let learner = server.client().await;
+    assert_eq!(export(&learner, &Default::default()).await, requests.concat());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_wrong_request_ends_the_stream_and_leaves_what_came_before() {
+    let (_data, server) = start();
+    let mut wrong = trajectory(101);
+    wrong.actions = pack([9_u32; 3]);
+    let (answers, end) = record(
+        &server,
+        vec![
+            vec![trajectory(0)],
+            vec![trajectory(1), trajectory(2)],
+            vec![trajectory(100), wrong],
+            vec![trajectory(3)],
+        ],
+    )
+    .await;
+    assert_eq!(answers.len(), 2);
+    assert_eq!(blamed(end.expect_err("refused")), (Code::InvalidArgument, "trajectories[1].actions".into()));
+    let (answers, end) = record(&server, vec![vec![trajectory(4)], vec![]]).await;
+    assert_eq!(answers.len(), 1);
+    assert_eq!(blamed(end.expect_err("refused")), (Code::InvalidArgument, "trajectories".into()));
+    // The same id with another content.
+    let mut other = trajectory(1);
+    other.style = "other".into();
+    let (answers, end) = record(&server, vec![vec![trajectory(5)], vec![trajectory(6), other]]).await;
+    assert_eq!(answers.len(), 1);
+    assert_eq!(blamed(end.expect_err("refused")), (Code::AlreadyExists, "trajectories[1].trajectory_id".into()));
+    let stored = export(&server.client().await, &Default::default()).await;
+    assert_eq!(stored, [0, 1, 2, 4, 5].map(trajectory));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn each_wrong_field_of_a_trajectory_is_named() {
+    let (_data, server) = start();
+    type Change = fn(&mut pb::Trajectory);
+    let cases: [(&str, Change); 12] = [
+        ("trajectory_id", |t| t.trajectory_id = "7".into()),
+        ("trajectory_id", |t| t.trajectory_id = Uuid::nil().simple().to_string()),
+        ("env_id", |t| t.env_id.clear()),
+        ("style", |t| t.style = "x".repeat(201)),
+        ("model_id", |t| t.model_id = "model".into()),
+        ("n_states", |t| t.n_states = 0),
+        ("n_actions", |t| t.n_actions = u32::MAX),
+        ("states", |t| t.states = vec![0; 13].into()),
+        ("states", |t| t.states = pack([-1_i32, 0, 0])),
+        ("actions", |t| t.actions.clear()),
+        ("rewards", |t| t.rewards = pack([f64::NAN; 3])),
+        ("final_state", |t| t.final_state = Some(57)),
+    ];
+    for (field, change) in cases {
+        let mut wrong = trajectory(40);
+        change(&mut wrong);
+        let (answers, end) = record(&server, vec![vec![wrong]]).await;
+        assert!(answers.is_empty());
+        let expected = (Code::InvalidArgument, format!("trajectories[0].{field}"));
+        assert_eq!(blamed(end.expect_err("refused")), expected);
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn limits_are_refused_with_resource_exhausted() {
+    let data = tempfile::tempdir().expect("a directory");
+    let limits = Limits {
+        max_message_bytes: 10_000,
+        max_trajectories_per_request: 3,
+        max_steps_per_trajectory: 50,
+        max_model_rows: 100,
+        ..Limits::default()
+    };
+    let server = LearnerServer::with(data.path(), limits);
+    let long = |steps: usize| pb::Trajectory { states: pack(vec![0_u32; steps]), ..trajectory(0) };
+    for (request, field) in [
+        ((0..4).map(trajectory).collect(), "trajectories"),
+        (vec![trajectory(1), long(51)], "trajectories[1].states"),
+        (vec![long(5000)], ""),
+    ] {
+        let (_, end) = record(&server, vec![request]).await;
+        assert_eq!(blamed(end.expect_err("refused")), (Code::ResourceExhausted, field.into()));
+    }
+    let error = server.client().await.put_model(&maze().await).await.expect_err("refused");
+    assert_eq!(blame(&error), (Code::ResourceExhausted, "part.header.n_states".into()));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn lists_come_in_pages_and_deletions_need_a_condition() {
+    let (_data, server) = start();
+    let learner = server.client().await;
+    let mut recorder = learner.recorder();
+    for number in 0..25 {
+        recorder.record(trajectory(number)).await.expect("a trajectory");
+    }
+    recorder.finish().await.expect("everything stored");
+    let filter = pb::TrajectoryFilter { style: "brisk".into(), ..Default::default() };
+    let expected = (0..25).filter(|n| n % 3 != 0).map(|n| trajectory(n).trajectory_id).collect::<Vec<_>>();
+    let (mut listed, mut token) = (Vec::new(), String::new());
+    loop {
+        let page = learner.list_trajectories_page(&filter, 5, &token).await.expect("a page");
+        assert_eq!(page.total, expected.len() as u64);
+        assert!(page.trajectories.len() <= 5);
+        listed.extend(page.trajectories.into_iter().map(|t| t.trajectory_id));
+        token = page.next_page_token;
+        if token.is_empty() {
+            break;
+        }
+        // A token belongs to its filter.
+        let error = learner.list_trajectories_page(&Default::default(), 5, &token).await.expect_err("refused");
+        assert_eq!(blame(&error), (Code::InvalidArgument, "page_token".into()));
+    }
+    assert_eq!(listed, expected);
+    let error = learner.list_trajectories_page(&filter, 10_001, "").await.expect_err("refused");
+    assert_eq!(blame(&error), (Code::InvalidArgument, "page_size".into()));
+    let wrong = pb::TrajectoryFilter { trajectory_ids: vec!["x".into()], ..Default::default() };
+    let error = learner.list_trajectories(&wrong).await.expect_err("refused");
+    assert_eq!(blame(&error), (Code::InvalidArgument, "filter.trajectory_ids[0]".into()));
+
+    let error = learner.delete_trajectories(&Default::default()).await.expect_err("refused");
+    assert_eq!(blame(&error), (Code::InvalidArgument, "filter".into()));
+    assert_eq!(learner.delete_trajectories(&filter).await.expect("deleted"), expected.len() as u64);
+    assert_eq!(learner.count_trajectories(&Default::default()).await.expect("a count"), 9);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn models_are_verified_named_and_stored_once() {
+    let (_data, server) = start();
+    let learner = server.client().await;
+    let model = maze().await;
+    let first = learner.put_model(&model).await.expect("a model");
+    assert_eq!((first.model_id.as_str(), first.already_stored), (model.model_id.as_str(), false));
+    assert!(learner.put_model(&model).await.expect("a model").already_stored);
+    let listed = learner.list_models("Maze-v0").await.expect("models");
+    assert_eq!(listed.len(), 1);
+    assert_eq!((listed[0].n_states, listed[0].n_actions), (57, 4));
+    assert_eq!(listed[0].n_transitions, model.probabilities.len() as u64);
+    assert!(learner.list_models("Other-v0").await.expect("models").is_empty());
+
+    type Change = fn(&mut Vec<ModelPart>);
+    fn header(parts: &mut [ModelPart]) -> &mut mazeway_proto::env::ModelHeader {
+        match &mut parts[0].part {
+            Some(Part::Header(header)) => header,
+            _ => panic!("the first part is the header"),
+        }
+    }
+    fn rows(parts: &mut [ModelPart]) -> &mut mazeway_proto::env::RowBlock {
+        match &mut parts[1].part {
+            Some(Part::Rows(rows)) => rows,
+            _ => panic!("the second part is rows"),
+        }
+    }
+    let cases: [(&str, Change); 13] = [
+        ("part", |p| p[0].part = None),
+        ("part.header", |p| p.clear()),
+        ("part.header", |p| p.insert(1, p[0].clone())),
+        ("part.rows", |p| p.swap(0, 1)),
+        ("part.rows.first_row", |p| rows(p).first_row = 1),
+        ("part.rows.row_lengths", |p| p.truncate(1)),
+        ("part.rows.next_states", |p| rows(p).next_states = pack([0_u32])),
+        ("part.rows.probabilities", |p| {
+            let mut all = Packed::<f64>::new(rows(p).probabilities.clone()).expect("an array").to_vec();
+            all[0] += 1e-6;
+            rows(p).probabilities = pack(all);
+        }),
+        ("part.header.model_id", |p| header(p).model_id = "0".repeat(64)),
+        ("part.header.env_id", |p| header(p).env_id.clear()),
+        ("part.header.state_labels", |p| header(p).state_labels = vec!["one".into()]),
+        ("part.header.initial_distribution", |p| header(p).initial_distribution = pack([0.5; 57])),
+        ("part.header.rewards[0].values", |p| header(p).rewards[0].values = pack([0.0])),
+    ];
+    for (field, change) in cases {
+        let mut parts = model.parts().collect::<Vec<_>>();
+        change(&mut parts);
+        let error = learner.put_model_parts(parts).await.expect_err(field);
+        assert_eq!(blame(&error), (Code::InvalidArgument, field.into()), "{error}");
+    }
+    assert_eq!(learner.list_models("").await.expect("models").len(), 1);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn fits_over_the_wire_reproduce_the_reference_and_are_kept() {
+    let (data, server) = start();
+    let (learner, model) = with_demonstrations(&server).await;
+    let cases = reference("maze_fits.json")["cases"].as_array().expect("cases").clone();
+    let mut ids = Vec::new();
+    for case in cases.iter().filter(|case| case["method"] == "em") {
+        let uniform = case["horizon_prior"] == "uniform";
+        let simplex = case["m_step"] == "simplex";
+        let request = pb::FitRequest {
+            method: "em".into(),
+            filter: Some(pb::TrajectoryFilter { style: "goals".into(), ..Default::default() }),
+            options: Some(pb::FitOptions {
+                horizon_prior: if uniform { pb::HorizonPrior::Uniform } else { pb::HorizonPrior::Geometric } as i32,
+                m_step: if simplex { pb::MStep::Simplex } else { pb::MStep::Nnls } as i32,
+                ..Default::default()
+            }),
+            ..Default::default()
+        };
+        let mut progress = 0;
+        let fit = learner.fit(request, |_| progress += 1).await.expect("a fit");
+        assert!(progress >= 1);
+        let weights = Packed::<f64>::new(fit.weights.clone()).expect("an array").to_vec();
+        let expected = case["weights"].as_array().expect("weights").iter().map(|v| v.as_f64().expect("a number"));
+        assert_eq!(weights.len(), 57);
+        for (state, (w, e)) in weights.iter().zip(expected).enumerate() {
+            assert!((w - e).abs() < 1e-6, "{} {state}: expected {e}, got {w}", case["m_step"]);
+        }
+        assert_eq!((fit.env_id.as_str(), fit.style.as_str()), ("Maze-v0", "goals"));
+        assert_eq!((&fit.model_id, fit.trajectory_ids.len(), fit.steps), (&model.model_id, 20, 1000));
+        assert_eq!(fit.trace.len(), fit.iterations as usize);
+        let visits = Packed::<f64>::new(fit.state_visits.clone()).expect("an array");
+        assert_eq!(visits.iter().sum::<f64>(), 1000.0);
+        assert_eq!(fit.states_covered as usize, visits.iter().filter(|&n| n > 0.0).count());
+        // The defaults are written down.
+        let options = fit.request.clone().expect("a request").options.expect("options");
+        assert_eq!((options.discount, options.max_iterations), (Some(0.9), Some(1000)));
+        assert_eq!(options.basis, pb::Basis::State as i32);
+        // What was stored is what was sent, and a prefix names it.
+        assert_eq!(learner.get_fit(&fit.fit_id[..8]).await.expect("the fit"), fit);
+        ids.push(fit.fit_id);
+    }
+    assert_eq!(ids.len(), 4);
+    server.stop();
+    let server = LearnerServer::start(data.path());
+    let learner = server.client().await;
+    let listed = learner.list_fits("Maze-v0", "goals").await.expect("fits");
+    assert!(listed.iter().map(|fit| &fit.fit_id).eq(ids.iter().rev()), "newest first");
+    assert!(learner.list_fits("", "other").await.expect("fits").is_empty());
+    learner.delete_fit(&ids[0]).await.expect("deleted");
+    for error in [
+        learner.delete_fit(&ids[0]).await.expect_err("gone"),
+        learner.get_fit(&ids[0]).await.map(drop).expect_err("gone"),
+    ] {
+        assert_eq!(blame(&error), (Code::NotFound, "fit_id".into()));
+    }
+    let error = learner.get_fit("abc").await.expect_err("too short");
+    assert_eq!(blame(&error), (Code::InvalidArgument, "fit_id".into()));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_fit_without_what_it_needs_is_refused() {
+    let (_data, server) = start();
+    let (learner, model) = with_demonstrations(&server).await;
+    let mut recorder = learner.recorder();
+    for number in 0..3 {
+        recorder.record(trajectory(number)).await.expect("no model");
+    }
+    let mut elsewhere = trajectory(50);
+    elsewhere.model_id = "0".repeat(64);
+    elsewhere.style = "elsewhere".into();
+    recorder.record(elsewhere).await.expect("an unknown model");
+    let mut smaller = trajectory(51);
+    (smaller.style, smaller.n_states) = ("smaller".into(), 60);
+    recorder.record(smaller).await.expect("another process");
+    recorder.finish().await.expect("everything stored");
+
+    let request = |method: &str, style: &str| pb::FitRequest {
+        method: method.into(),
+        filter: Some(pb::TrajectoryFilter { style: style.into(), ..Default::default() }),
+        ..Default::default()
+    };
+    let options = |options: pb::FitOptions| pb::FitRequest { options: Some(options), ..request("em", "goals") };
+    let in_model = |style: &str, id: &str| pb::FitRequest { model_id: id.into(), ..request("bc", style) };
+    let cases = [
+        (request("magic", "goals"), Code::InvalidArgument, "method"),
+        (options(pb::FitOptions { planner: 99, ..Default::default() }), Code::InvalidArgument, "options.planner"),
+        (options(pb::FitOptions { horizon: Some(0), ..Default::default() }), Code::InvalidArgument, "options.horizon"),
+        (
+            options(pb::FitOptions { discount: Some(1.5), ..Default::default() }),
+            Code::InvalidArgument,
+            "options.discount",
+        ),
+        (in_model("goals", "no id"), Code::InvalidArgument, "model_id"),
+        (in_model("goals", &"1".repeat(64)), Code::NotFound, "model_id"),
+        (request("bc", "elsewhere"), Code::NotFound, "model_id"),
+        (in_model("smaller", &model.model_id), Code::InvalidArgument, "model_id"),
+        (request("bc", "nobody"), Code::FailedPrecondition, "filter"),
+        (pb::FitRequest { max_trajectories: 21, ..request("bc", "goals") }, Code::FailedPrecondition, "filter"),
+        (request("bc", "brisk"), Code::FailedPrecondition, "model_id"),
+        (request("bc", ""), Code::FailedPrecondition, "model_id"),
+    ];
+    for (request, code, field) in cases {
+        let error = learner.fit(request.clone(), |_| ()).await.expect_err("refused");
+        assert_eq!(blame(&error), (code, field.into()), "{request:?}: {error}");
+    }
+    assert!(learner.list_fits("", "").await.expect("fits").is_empty());
+    // The first ten, cut at five steps.
+    let request = pb::FitRequest {
+        max_trajectories: 10,
+        options: Some(pb::FitOptions { horizon: Some(5), ..Default::default() }),
+        ..request("bc", "goals")
+    };
+    let fit = learner.fit(request, |_| ()).await.expect("a fit");
+    assert_eq!((fit.trajectory_ids.len(), fit.steps), (10, 50));
+    let filter = pb::TrajectoryFilter { style: "goals".into(), ..Default::default() };
+    let first = learner.list_trajectories_page(&filter, 10, "").await.expect("a page").trajectories;
+    assert!(first.iter().map(|t| &t.trajectory_id).eq(&fit.trajectory_ids));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_fit_ends_when_its_caller_goes_and_the_next_one_begins() {
+    let data = tempfile::tempdir().expect("a directory");
+    let limits = Limits { max_concurrent_fits: 1, max_queued_fits: 1, ..Limits::default() };
+    let server = LearnerServer::with(data.path(), limits);
+    let (learner, _) = with_demonstrations(&server).await;
+    let filter = Some(pb::TrajectoryFilter { style: "goals".into(), ..Default::default() });
+    // Its duality gap never reaches 0: it would run for hours.
+    let endless = pb::FitRequest {
+        method: "em-mixture".into(),
+        filter: filter.clone(),
+        options: Some(pb::FitOptions { tolerance: Some(0.0), max_iterations: Some(u32::MAX), ..Default::default() }),
+        ..Default::default()
+    };
+    let quick = pb::FitRequest { method: "bc".into(), filter, ..Default::default() };
+    let mut running = learner.fit_stream(endless.clone()).await.expect("a stream");
+    let first = timeout(PATIENCE, running.next()).await.expect("progress").expect("progress");
+    assert!(matches!(first, Some(Event::Progress(_))));
+    let waiting = tokio::spawn({
+        let (learner, quick) = (learner.clone(), quick.clone());
+        async move { learner.fit(quick, |_| ()).await }
+    });
+    // One runs, one waits: a third is refused.
+    let refused = async {
+        loop {
+            // A fit that does not get in is refused at once; one that gets in before the other is let go again.
+            match timeout(Duration::from_millis(200), learner.fit(quick.clone(), |_| ())).await {
+                Ok(Err(error)) => return error,
+                Ok(Ok(_)) => panic!("a fit before its turn"),
+                Err(_) => {}
+            }
+        }
+    };
+    let error = timeout(PATIENCE, refused).await.expect("a refusal");
+    assert_eq!(error.code(), Code::ResourceExhausted);
+    assert!(!waiting.is_finished());
+    drop(running);
+    let outcome = timeout(PATIENCE, waiting).await.expect("its turn").expect("no panic");
+    let fit = match outcome {
+        Ok(fit) => fit,
+        // The probe above stood in the queue first.
+        Err(error) if error.code() == Code::ResourceExhausted => learner.fit(quick, |_| ()).await.expect("its turn"),
+        Err(error) => panic!("{error}"),
+    };
+    let stored = learner.list_fits("", "").await.expect("fits");
+    assert!(stored.iter().any(|f| f.fit_id == fit.fit_id));
+    assert!(stored.iter().all(|f| f.method == "bc"), "the fit whose caller went is not stored");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_stop_loses_nothing_that_was_acknowledged() {
+    let (data, server) = start();
+    let address = server.socket();
+    let mut recorder = Recorder::connect(&server.address()).await.expect("a learner");
+    for number in 0..3000 {
+        recorder.record(trajectory(number)).await.expect("a trajectory");
+    }
+    let acknowledged = recorder.receipt().acknowledged();
+    assert!(acknowledged > 0 && recorder.unacknowledged() > 0);
+    tokio::task::spawn_blocking(move || server.stop()).await.expect("a stop");
+    let server = LearnerServer::at(address, data.path(), Limits::default());
+    let stored = export(&server.client().await, &Default::default()).await;
+    assert!(stored.len() as u64 >= acknowledged);
+    assert!(stored.iter().enumerate().all(|(i, t)| *t == trajectory(i as u128)));
+    // The recorder goes on where the other left off.
+    let receipt = timeout(PATIENCE, recorder.finish()).await.expect("an end").expect("everything stored");
+    assert_eq!(receipt.acknowledged(), 3000);
+    assert_eq!(export(&server.client().await, &Default::default()).await.len(), 3000);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_recorder_gives_up_what_is_refused_and_nothing_else() {
+    let (_data, server) = start();
+    let mut recorder = Recorder::connect(&server.address()).await.expect("a learner");
+    recorder.record(trajectory(1)).await.expect("a trajectory");
+    recorder.flush().await.expect("stored");
+    let mut other = trajectory(1);
+    other.source = "other".into();
+    let id = other.trajectory_id.clone();
+    for trajectory in [trajectory(2), other, trajectory(3)] {
+        recorder.record(trajectory).await.expect("taken");
+    }
+    let error = recorder.flush().await.expect_err("one is refused");
+    assert_eq!(blame(&error), (Code::AlreadyExists, "trajectory_id".into()));
+    assert!(error.to_string().contains(&id), "{error}");
+    let receipt = recorder.finish().await.expect("the others are stored");
+    assert_eq!((receipt.stored, receipt.duplicates), (3, 0));
+    let stored = export(&server.client().await, &Default::default()).await;
+    assert_eq!(stored, [1, 2, 3].map(trajectory));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn health_and_reflection_answer() {
+    use tonic_health::pb::{HealthCheckRequest, health_check_response::ServingStatus, health_client::HealthClient};
+    use tonic_reflection::pb::v1::{
+        ServerReflectionRequest, server_reflection_client::ServerReflectionClient,
+        server_reflection_request::MessageRequest, server_reflection_response::MessageResponse,
+    };
+    let (_data, server) = start();
+    let channel = mazeway_client::channel(&server.address()).await.expect("a learner");
+    let service = "mazeway.learner.v1.LearnerService".to_owned();
+    let request = HealthCheckRequest { service: service.clone() };
+    let health = HealthClient::new(channel.clone()).check(request).await.expect("health").into_inner();
+    assert_eq!(health.status(), ServingStatus::Serving);
+    let ask = ServerReflectionRequest {
+        host: String::new(),
+        message_request: Some(MessageRequest::ListServices(String::new())),
+    };
+    let mut answers = ServerReflectionClient::new(channel)
+        .server_reflection_info(tokio_stream::iter([ask]))
+        .await
+        .expect("reflection")
+        .into_inner();
+    let answer = answers.message().await.expect("an answer").expect("an answer").message_response;
+    let Some(MessageResponse::ListServicesResponse(list)) = answer else { panic!("expected services, got {answer:?}") };
+    assert!(list.service.iter().any(|s| s.name == service), "{list:?}");
+}

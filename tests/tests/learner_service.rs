@@ -442,32 +442,21 @@ async fn a_fit_ends_when_its_caller_goes_and_the_next_one_begins() {
     let mut running = learner.fit_stream(endless.clone()).await.expect("a stream");
     let first = timeout(PATIENCE, running.next()).await.expect("progress").expect("progress");
     assert!(matches!(first, Some(Event::Progress(_))));
-    let waiting = tokio::spawn({
-        let (learner, quick) = (learner.clone(), quick.clone());
-        async move { learner.fit(quick, |_| ()).await }
-    });
     // One runs, one waits: a third is refused.
-    let refused = async {
-        loop {
-            // A fit that does not get in is refused at once; one that gets in before the other is let go again.
-            match timeout(Duration::from_millis(200), learner.fit(quick.clone(), |_| ())).await {
-                Ok(Err(error)) => return error,
-                Ok(Ok(_)) => panic!("a fit before its turn"),
-                Err(_) => {}
-            }
+    let mut waiting = learner.fit_stream(quick.clone()).await.expect("a place in the queue");
+    let error = learner.fit_stream(quick.clone()).await.expect_err("a full queue");
+    assert_eq!(error.code(), Code::ResourceExhausted);
+    assert!(timeout(Duration::from_millis(300), waiting.next()).await.is_err(), "it waits its turn");
+    drop(running);
+    let fit = loop {
+        match timeout(PATIENCE, waiting.next()).await.expect("its turn").expect("a fit") {
+            Some(Event::Fit(fit)) => break fit,
+            Some(Event::Progress(_)) => {}
+            None => panic!("the stream of a fit ended without a fit"),
         }
     };
-    let error = timeout(PATIENCE, refused).await.expect("a refusal");
-    assert_eq!(error.code(), Code::ResourceExhausted);
-    assert!(!waiting.is_finished());
-    drop(running);
-    let outcome = timeout(PATIENCE, waiting).await.expect("its turn").expect("no panic");
-    let fit = match outcome {
-        Ok(fit) => fit,
-        // The probe above stood in the queue first.
-        Err(error) if error.code() == Code::ResourceExhausted => learner.fit(quick, |_| ()).await.expect("its turn"),
-        Err(error) => panic!("{error}"),
-    };
+    // The place is free again.
+    learner.fit(quick, |_| ()).await.expect("a fit");
     let stored = learner.list_fits("", "").await.expect("fits");
     assert!(stored.iter().any(|f| f.fit_id == fit.fit_id));
     assert!(stored.iter().all(|f| f.method == "bc"), "the fit whose caller went is not stored");
@@ -478,7 +467,7 @@ async fn a_stop_loses_nothing_that_was_acknowledged() {
     let (data, server) = start();
     let address = server.socket();
     let mut recorder = Recorder::connect(&server.address()).await.expect("a learner");
-    for number in 0..3000 {
+    for number in 0..10_000 {
         recorder.record(trajectory(number)).await.expect("a trajectory");
     }
     let acknowledged = recorder.receipt().acknowledged();
@@ -490,8 +479,8 @@ async fn a_stop_loses_nothing_that_was_acknowledged() {
     assert!(stored.iter().enumerate().all(|(i, t)| *t == trajectory(i as u128)));
     // The recorder goes on where the other left off.
     let receipt = timeout(PATIENCE, recorder.finish()).await.expect("an end").expect("everything stored");
-    assert_eq!(receipt.acknowledged(), 3000);
-    assert_eq!(export(&server.client().await, &Default::default()).await.len(), 3000);
+    assert_eq!(receipt.acknowledged(), 10_000);
+    assert_eq!(export(&server.client().await, &Default::default()).await.len(), 10_000);
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -37,30 +37,32 @@ pub async fn run(args: ServeArgs) -> Result<(), CliError> {
     let cannot = |error: std::io::Error| {
         CliError::failure(format!("cannot listen on {listen}: {error}"), "take a free port: --listen 127.0.0.1:0")
     };
+    let no_signals =
+        |error| CliError::failure(format!("cannot watch for signals: {error}"), "raise the limit on open files");
+    let stopped = stop_signal().map_err(no_signals)?;
     let listener = TcpListener::bind(listen).await.map_err(cannot)?;
     let address = listener.local_addr().map_err(cannot)?;
     // Whoever started this may have closed the other end; the service serves all the same.
     let _ = writeln!(std::io::stdout(), "listening on {address}").and_then(|()| std::io::stdout().flush());
-    mazeway_learner::serve(Config { data, limits }, listener, stop_signal()).await?;
+    mazeway_learner::serve(Config { data, limits }, listener, stopped).await?;
     Ok(())
 }
 
-/// SIGINT or SIGTERM.
-async fn stop_signal() {
+/// SIGINT or SIGTERM. They are watched from the call on, not only once the future is waited for.
+fn stop_signal() -> std::io::Result<impl Future<Output = ()>> {
     #[cfg(unix)]
     {
         use tokio::signal::unix::{SignalKind, signal};
-        match signal(SignalKind::terminate()) {
-            Ok(mut terminate) => tokio::select! {
-                _ = tokio::signal::ctrl_c() => {}
+        let (mut interrupt, mut terminate) = (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?);
+        Ok(async move {
+            tokio::select! {
+                _ = interrupt.recv() => {}
                 _ = terminate.recv() => {}
-            },
-            Err(error) => {
-                tracing::warn!(%error, "SIGTERM ends the service at once");
-                let _ = tokio::signal::ctrl_c().await;
             }
-        }
+        })
     }
     #[cfg(not(unix))]
-    let _ = tokio::signal::ctrl_c().await;
+    Ok(async {
+        let _ = tokio::signal::ctrl_c().await;
+    })
 }

@@ -46,6 +46,9 @@ pub struct Limits {
     /// Fits that wait their turn
     #[arg(long, env = "MAZEWAY_LEARNER_MAX_QUEUED_FITS", default_value_t = 64, value_name = "N")]
     pub max_queued_fits: usize,
+    /// Iterations that a fit may ask for
+    #[arg(long, env = "MAZEWAY_LEARNER_MAX_FIT_ITERATIONS", default_value_t = 1_000_000, value_name = "N")]
+    pub max_fit_iterations: u32,
     /// Calls and streams of one connection at a time
     #[arg(long, env = "MAZEWAY_LEARNER_MAX_STREAMS", default_value_t = 256, value_name = "N")]
     pub max_streams_per_connection: u32,
@@ -69,6 +72,7 @@ impl Default for Limits {
             max_model_transitions: 20_000_000,
             max_concurrent_fits: 2,
             max_queued_fits: 64,
+            max_fit_iterations: 1_000_000,
             max_streams_per_connection: 256,
             keepalive: Duration::from_secs(10),
             shutdown_grace: Duration::from_secs(10),

@@ -397,6 +397,16 @@ async fn a_fit_without_what_it_needs_is_refused() {
             Code::InvalidArgument,
             "options.discount",
         ),
+        (
+            options(pb::FitOptions { horizon: Some(u32::MAX), ..Default::default() }),
+            Code::ResourceExhausted,
+            "options.horizon",
+        ),
+        (
+            options(pb::FitOptions { max_iterations: Some(u32::MAX), ..Default::default() }),
+            Code::ResourceExhausted,
+            "options.max_iterations",
+        ),
         (in_model("goals", "no id"), Code::InvalidArgument, "model_id"),
         (in_model("goals", &"1".repeat(64)), Code::NotFound, "model_id"),
         (request("bc", "elsewhere"), Code::NotFound, "model_id"),
@@ -424,21 +434,67 @@ async fn a_fit_without_what_it_needs_is_refused() {
     assert!(first.iter().map(|t| &t.trajectory_id).eq(&fit.trajectory_ids));
 }
 
+/// A model in which every state leads to every other, more likely to those that follow it.
+fn everywhere(n_states: u32, n_actions: u32) -> Vec<ModelPart> {
+    let header =
+        mazeway_proto::env::ModelHeader { env_id: "Everywhere-v0".into(), n_states, n_actions, ..Default::default() };
+    let mut parts = vec![ModelPart { part: Some(Part::Header(header)) }];
+    for state in 0..n_states {
+        let first_row = state * n_actions;
+        let weight = move |action: u32, next: u32| 1.0 + f64::from((next + n_states - state) * (action + 1) % n_states);
+        let probabilities = (0..n_actions).flat_map(|action| {
+            let sum = (0..n_states).map(|next| weight(action, next)).sum::<f64>();
+            (0..n_states).map(move |next| weight(action, next) / sum)
+        });
+        let rows = mazeway_proto::env::RowBlock {
+            first_row,
+            row_lengths: pack(vec![n_states; n_actions as usize]),
+            next_states: pack((0..n_actions).flat_map(|_| 0..n_states)),
+            probabilities: pack(probabilities),
+            ..Default::default()
+        };
+        parts.push(ModelPart { part: Some(Part::Rows(rows)) });
+    }
+    parts
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn a_fit_ends_when_its_caller_goes_and_the_next_one_begins() {
     let data = tempfile::tempdir().expect("a directory");
     let limits = Limits { max_concurrent_fits: 1, max_queued_fits: 1, ..Limits::default() };
     let server = LearnerServer::with(data.path(), limits);
     let (learner, _) = with_demonstrations(&server).await;
-    let filter = Some(pb::TrajectoryFilter { style: "goals".into(), ..Default::default() });
-    // Its duality gap never reaches 0: it would run for hours.
+    let filter = |style: &str| Some(pb::TrajectoryFilter { style: style.into(), ..Default::default() });
+    // Every iteration solves for 500 states that all lead everywhere, and without a penalty the likelihood of what was
+    // never seen has no maximum: it would run for minutes.
+    let model = everywhere(500, 4);
+    let model_id = learner.put_model_parts(model).await.expect("a model").model_id;
+    let mut recorder = learner.recorder();
+    let demonstration = Demonstration {
+        env_id: "Everywhere-v0".into(),
+        style: "wandering".into(),
+        model_id,
+        n_states: 500,
+        n_actions: 4,
+        states: (0..200).map(|step| step * 7 % 500).collect(),
+        actions: (0..200).map(|step| step * step % 4).collect(),
+        ..Demonstration::default()
+    };
+    recorder.record(demonstration).await.expect("a demonstration");
+    recorder.finish().await.expect("stored");
     let endless = pb::FitRequest {
-        method: "em-mixture".into(),
-        filter: filter.clone(),
-        options: Some(pb::FitOptions { tolerance: Some(0.0), max_iterations: Some(u32::MAX), ..Default::default() }),
+        method: "em-tied".into(),
+        filter: filter("wandering"),
+        options: Some(pb::FitOptions {
+            basis: pb::Basis::StateAction as i32,
+            penalty: pb::Penalty::None as i32,
+            tolerance: Some(0.0),
+            max_iterations: Some(1_000_000),
+            ..Default::default()
+        }),
         ..Default::default()
     };
-    let quick = pb::FitRequest { method: "bc".into(), filter, ..Default::default() };
+    let quick = pb::FitRequest { method: "bc".into(), filter: filter("goals"), ..Default::default() };
     let mut running = learner.fit_stream(endless.clone()).await.expect("a stream");
     let first = timeout(PATIENCE, running.next()).await.expect("progress").expect("progress");
     assert!(matches!(first, Some(Event::Progress(_))));

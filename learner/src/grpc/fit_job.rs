@@ -2,6 +2,7 @@
 
 use super::{from_proto, options, status::CallError};
 use crate::{
+    config::Limits,
     eval,
     irl::{self, FitError, FitOptions, Method, Problem, TraceEntry},
     mdp::TabularMdp,
@@ -33,7 +34,7 @@ struct Data {
 
 impl FitJob {
     /// Checks a request as far as that goes without the data.
-    pub fn new(mut request: pb::FitRequest) -> Result<Self, CallError> {
+    pub fn new(mut request: pb::FitRequest, limits: &Limits) -> Result<Self, CallError> {
         let method = irl::method(&request.method).ok_or_else(|| {
             let known = irl::METHODS.iter().map(|method| method.id()).collect::<Vec<_>>().join(", ");
             CallError::field("method", format!("expected one of {known}, got {:?}", clip(&request.method)))
@@ -41,6 +42,15 @@ impl FitJob {
         let filter = from_proto::filter(request.filter.clone())?;
         check_model_id("model_id", &request.model_id)?;
         let options = options::from_proto(request.options.as_ref())?;
+        // What is kept of a fit grows with its iterations, what a planner holds with the horizon.
+        for (field, what, limit, got) in [
+            ("options.max_iterations", "iterations", limits.max_fit_iterations, options.max_iterations),
+            ("options.horizon", "steps", limits.max_steps_per_trajectory as u32, options.horizon.unwrap_or(0)),
+        ] {
+            if got > limit {
+                return Err(CallError::Limit { field: field.into(), what, limit: limit.into(), got: got.into() });
+            }
+        }
         request.options = Some(options::to_proto(&options));
         request.filter.get_or_insert_default();
         Ok(Self { request, method, filter, options })

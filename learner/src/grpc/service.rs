@@ -165,7 +165,7 @@ impl LearnerService for LearnerGrpc {
     }
 
     async fn fit(&self, request: Request<pb::FitRequest>) -> Result<Response<Self::FitStream>, Status> {
-        let job = FitJob::new(request.into_inner())?;
+        let job = FitJob::new(request.into_inner(), &self.limits)?;
         let stream = self.fits.submit(job, self.store.clone())?;
         Ok(Response::new(ReceiverStream::new(stream)))
     }

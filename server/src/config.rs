@@ -36,8 +36,8 @@ pub struct Config {
     /// Connections at a time; a further one is closed at once.
     #[arg(long, env = "MAZEWAY_MAX_CONNECTIONS", default_value_t = 1024, value_name = "N")]
     pub max_connections: usize,
-    /// Calls and streams of one connection at a time.
-    #[arg(long, env = "MAZEWAY_MAX_STREAMS_PER_CONNECTION", default_value_t = 256, value_name = "N")]
+    /// Calls and streams of one connection at a time; a further one waits, so leave room for more than its sessions.
+    #[arg(long, env = "MAZEWAY_MAX_STREAMS_PER_CONNECTION", default_value_t = 2048, value_name = "N")]
     pub max_streams_per_connection: u32,
     /// Time between HTTP/2 pings that find out whether a silent peer is still there, in seconds.
     #[arg(long = "keepalive-secs", env = "MAZEWAY_KEEPALIVE_SECS", default_value = "10", value_parser = seconds, value_name = "SECS")]
@@ -60,7 +60,7 @@ impl Default for Config {
             max_rollout_steps: 1_000_000_000,
             max_concurrent_models: 2,
             max_connections: 1024,
-            max_streams_per_connection: 256,
+            max_streams_per_connection: 2048,
             keepalive: Duration::from_secs(10),
             shutdown_grace: Duration::from_secs(5),
         }

@@ -444,6 +444,42 @@ async fn a_dropped_call_does_not_shift_the_answers() {
 }
 
 #[tokio::test]
+async fn many_steps_under_way_never_block_for_good() {
+    let server = EnvServer::start();
+    let connection = Connection::open(&server.address()).await.expect("connects");
+    let options = SessionOptions { max_episode_steps: Some(0), ..SessionOptions::default() };
+    let make = || VectorEnv::create(&connection, "Highway-v0", 1000, Autoreset::NextStep, options.clone());
+    let (mut envs, mut twin) = (make().await.expect("makes"), make().await.expect("makes"));
+    envs.reset(1).await.expect("resets");
+    twin.reset(1).await.expect("resets");
+    // Answers of 34 kB: far more than may be on the wire.
+    for i in 0..600 {
+        envs.send_step(&[i % 12; 1000]).await.expect("sends");
+    }
+    for i in 0..600 {
+        let expected = twin.step(&[i % 12; 1000]).await.expect("steps");
+        assert_eq!(envs.receive_step().await.expect("receives"), expected);
+    }
+    let error = envs.receive_step().await.expect_err("nothing is under way");
+    assert_eq!(error.field(), Some("request"), "{error}");
+    // Without a reader, the answers of a failed stream come first and its failure last.
+    for action in [0, 1, 99, 2] {
+        envs.send_step(&[action; 1000]).await.expect("sends");
+    }
+    for action in [0, 1] {
+        let expected = twin.step(&[action; 1000]).await.expect("steps");
+        assert_eq!(envs.receive_step().await.expect("receives"), expected);
+    }
+    let error = envs.receive_step().await.expect_err("no such action");
+    assert_eq!((error.code(), error.field()), (Code::InvalidArgument, Some("actions[0]")));
+    for _ in 0..4096 {
+        envs.send_step(&[0; 1000]).await.expect("sends");
+    }
+    let error = envs.send_step(&[0; 1000]).await.expect_err("too many");
+    assert_eq!(error.field(), Some("request"), "{error}");
+}
+
+#[tokio::test]
 async fn a_client_that_is_dropped_frees_its_session() {
     let server = EnvServer::with(Config { max_sessions: 1, ..config() });
     let connection = Connection::open(&server.address()).await.expect("connects");

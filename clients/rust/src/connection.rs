@@ -12,8 +12,10 @@ use tonic::transport::{Channel, Endpoint};
 
 /// Largest message taken in: above what a server sends by default.
 pub(crate) const MAX_MESSAGE_BYTES: usize = 64 << 20;
-/// Bytes under way before the receiver has read them.
-const WINDOW_BYTES: u32 = 4 << 20;
+/// Bytes of a stream that may wait for their reader.
+const STREAM_WINDOW_BYTES: u32 = 4 << 20;
+/// Bytes of all streams that may wait: so many that a stream nobody reads never holds up the others.
+const CONNECTION_WINDOW_BYTES: u32 = 1 << 30;
 
 /// Connects to a server at `address`, such as `127.0.0.1:50051` or `http://[::1]:50051`.
 ///
@@ -29,8 +31,8 @@ pub async fn channel(address: &str) -> Result<Channel, ClientError> {
         .http2_keep_alive_interval(Duration::from_secs(10))
         .keep_alive_timeout(Duration::from_secs(10))
         .keep_alive_while_idle(true)
-        .initial_stream_window_size(WINDOW_BYTES)
-        .initial_connection_window_size(WINDOW_BYTES);
+        .initial_stream_window_size(STREAM_WINDOW_BYTES)
+        .initial_connection_window_size(CONNECTION_WINDOW_BYTES);
     endpoint.connect().await.map_err(|error| ClientError::Connect { address: address.into(), message: causes(&error) })
 }
 

@@ -8,13 +8,18 @@ use crate::{
     spec::{Options, options_to_wire},
 };
 use mazeway_proto::env::{self as pb, AutoresetMode, interact_request::Request, interact_response::Response};
-use std::time::{Duration, Instant};
+use std::{
+    collections::VecDeque,
+    time::{Duration, Instant},
+};
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
-use tonic::{Code, Streaming};
+use tonic::{Code, Status, Streaming};
 
 /// Requests that may be on their way before their answers are read.
 const PIPELINE: usize = 64;
+/// Requests that may be sent before the first of their answers is received.
+const MAX_UNDER_WAY: usize = 4096;
 /// How long a session is tried to be taken up again, unless asked otherwise.
 const RESUME: Duration = Duration::from_secs(10);
 
@@ -64,12 +69,47 @@ pub struct Image {
     pub rgb: bytes::Bytes,
 }
 
-/// An open stream and how many answers are still to come on it.
+type Answer = Result<Option<pb::InteractResponse>, Status>;
+
+/// An open stream.
 #[derive(Debug)]
 struct Open {
     requests: mpsc::Sender<pb::InteractRequest>,
     answers: Streaming<pb::InteractResponse>,
+    /// Answers that were read to make room for further requests.
+    early: VecDeque<Answer>,
+    /// Requests whose answer nobody has received.
     awaited: usize,
+}
+
+impl Open {
+    async fn answer(&mut self) -> Answer {
+        match self.early.pop_front() {
+            Some(answer) => answer,
+            None => self.answers.message().await,
+        }
+    }
+
+    /// Sends a request, reading answers as long as there is no room for it: otherwise both sides could wait for each
+    /// other. False where the stream has ended.
+    async fn send(&mut self, message: pb::InteractRequest) -> bool {
+        let Self { requests, answers, early, awaited } = self;
+        loop {
+            let open = early.back().is_none_or(|answer| matches!(answer, Ok(Some(_))));
+            tokio::select! {
+                biased;
+                room = requests.reserve() => match room {
+                    Ok(room) => {
+                        room.send(message);
+                        *awaited += 1;
+                        return true;
+                    }
+                    Err(_) => return false,
+                },
+                answer = answers.message(), if open && *awaited > early.len() => early.push_back(answer),
+            }
+        }
+    }
 }
 
 #[derive(Debug)]
@@ -102,7 +142,7 @@ fn repeatable(request: &Request) -> bool {
 }
 
 /// True where the connection and not the server is to blame.
-fn is_broken(status: &tonic::Status) -> bool {
+fn is_broken(status: &Status) -> bool {
     use std::error::Error as _;
     matches!(status.code(), Code::Unavailable | Code::Cancelled)
         || (status.code() == Code::Unknown && status.source().is_some())
@@ -152,11 +192,11 @@ impl Session {
     }
 
     /// The stream, opened anew where there is none.
-    async fn stream(&mut self) -> Result<&mut Open, tonic::Status> {
+    async fn stream(&mut self) -> Result<&mut Open, Status> {
         if self.open.is_none() {
             let (requests, body) = mpsc::channel(PIPELINE);
             let answers = self.connection.service.clone().interact(ReceiverStream::new(body)).await?.into_inner();
-            self.open = Some(Open { requests, answers, awaited: 0 });
+            self.open = Some(Open { requests, answers, early: VecDeque::new(), awaited: 0 });
         }
         Ok(self.open.as_mut().expect("just opened"))
     }
@@ -179,16 +219,15 @@ impl Session {
         }
         let message = self.message(request);
         let open = self.stream().await?;
-        if open.requests.send(message).await.is_err() {
-            // Whoever read the requests has gone: the stream ended. Its last answer says why.
-            let ended = open.answers.message().await;
-            self.open = None;
-            return Err(match ended {
-                Err(status) => status.into(),
-                Ok(_) => ClientError::Interrupted { request: name(request), message: "the stream ended".into() },
-            });
+        if open.awaited == MAX_UNDER_WAY {
+            let message = format!("expected at most {MAX_UNDER_WAY} requests without receiving their answers");
+            return Err(ClientError::Argument { field: "request", message });
         }
-        open.awaited += 1;
+        if !open.send(message).await && open.awaited == 0 {
+            self.open = None;
+            return Err(ClientError::Interrupted { request: name(request), message: "the stream ended".into() });
+        }
+        // Where it ended with answers to come, the last of these says why.
         Ok(())
     }
 
@@ -200,7 +239,7 @@ impl Session {
                 message: "nothing was asked that is not answered".into(),
             });
         };
-        match open.answers.message().await {
+        match open.answer().await {
             Ok(Some(pb::InteractResponse { response: Some(response) })) => {
                 open.awaited -= 1;
                 Ok(response)
@@ -257,17 +296,16 @@ impl Session {
         let message = self.message(request);
         // Nothing was sent yet: whatever fails here may be tried again.
         let open = self.stream().await.map_err(|status| Attempt { retry: is_broken(&status), error: status.into() })?;
-        if open.requests.send(message).await.is_err() {
+        if !open.send(message).await {
             self.open = None;
             let error = ClientError::Interrupted { request: name(request), message: "the stream ended".into() };
             return Err(Attempt { retry: true, error });
         }
-        open.awaited += 1;
         let broken = |message: String| Attempt {
             retry: repeatable(request),
             error: ClientError::Interrupted { request: name(request), message },
         };
-        match open.answers.message().await {
+        match open.answer().await {
             Ok(Some(pb::InteractResponse { response: Some(response) })) => {
                 open.awaited -= 1;
                 Ok(response)

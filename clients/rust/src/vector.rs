@@ -164,10 +164,11 @@ impl VectorEnv {
         self.step_batch(answer)
     }
 
-    /// Sends actions without waiting: [`Self::receive_step`] brings what came of them, in order.
+    /// Sends actions without waiting: [`Self::receive_step`] brings what came of them, in order. Up to 4,096 steps may be
+    /// under way.
     ///
     /// # Errors
-    /// The stream has ended.
+    /// Too many are under way; the stream has ended.
     pub async fn send_step(&mut self, actions: &[u32]) -> Result<(), ClientError> {
         self.session.send(&Self::step_request(actions)).await?;
         Ok(())

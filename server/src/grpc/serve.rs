@@ -8,8 +8,10 @@ use tokio::{net::TcpListener, time::timeout};
 use tokio_util::sync::CancellationToken;
 use tonic::transport::{Server, server::TcpIncoming};
 
-/// Bytes of a stream, or of all streams of a connection, that may be under way: enough for a large batch's reply.
-const WINDOW_BYTES: u32 = 4 << 20;
+/// Bytes of a stream that may wait for their reader: some steps of the largest batch.
+const STREAM_WINDOW_BYTES: u32 = 1 << 20;
+/// Bytes of all streams of a connection that may wait: so many that a few blocked streams do not hold up the others.
+const CONNECTION_WINDOW_BYTES: u32 = 16 << 20;
 /// Time that a peer has to answer a ping.
 const PING_TIMEOUT: Duration = Duration::from_secs(10);
 
@@ -42,8 +44,8 @@ pub async fn serve(
     let mut builder = Server::builder()
         .http2_keepalive_interval(Some(config.keepalive))
         .http2_keepalive_timeout(Some(PING_TIMEOUT))
-        .initial_stream_window_size(WINDOW_BYTES)
-        .initial_connection_window_size(WINDOW_BYTES)
+        .initial_stream_window_size(STREAM_WINDOW_BYTES)
+        .initial_connection_window_size(CONNECTION_WINDOW_BYTES)
         .max_concurrent_streams(config.max_streams_per_connection)
         .concurrency_limit_per_connection(config.max_streams_per_connection as usize);
     let host = Arc::new(Host::new(config, stopping.clone()));

@@ -2,6 +2,7 @@
 
 use assert_cmd::Command;
 use mazeway_client::{Learner, Recorder};
+use mazeway_proto::learner as pb;
 use mazeway_tests::{
     learner::trajectory,
     programs::{Service, program},
@@ -196,7 +197,7 @@ async fn a_directory_is_listed_while_a_service_records_into_it() {
     }
     // The running service says the same.
     let learner_client = Learner::connect(service.address()).await.expect("a learner");
-    assert_eq!(learner_client.count_trajectories(&Default::default()).await.expect("a count"), seen);
+    assert_eq!(learner_client.count_trajectories(&pb::TrajectoryFilter::default()).await.expect("a count"), seen);
     let address = service.address().to_owned();
     let over = tokio::task::spawn_blocking(move || said(learner(&["list", "--json", "--addr", &address]))).await;
     assert!(over.expect("a list").contains("\"trajectories\":"));

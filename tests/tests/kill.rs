@@ -1,6 +1,7 @@
 //! Kills the real learner in the middle of recordings and looks for what it had acknowledged.
 
 use mazeway_client::{Learner, Recorder};
+use mazeway_proto::learner::{self as pb, learner_service_client::LearnerServiceClient};
 use mazeway_tests::{
     learner::{export, trajectory},
     programs::Service,
@@ -24,7 +25,6 @@ const BATCH: u128 = 5;
 
 /// Records batches on one stream until the service dies, and tells which batches were acknowledged.
 async fn record_until_death(address: String, first: u128, acknowledged: Arc<AtomicU64>) -> Vec<u128> {
-    use mazeway_proto::learner::{self as pb, learner_service_client::LearnerServiceClient};
     let mut service = LearnerServiceClient::connect(format!("http://{address}")).await.expect("a learner that answers");
     let (requests, stream) = mpsc::channel(8);
     let sender = tokio::spawn(async move {
@@ -58,7 +58,7 @@ async fn what_was_acknowledged_survives_kills() {
     for round in 0..ROUNDS {
         let service = Service::learner(data.path());
         let learner = Learner::connect(service.address()).await.expect("a learner that opens what was killed");
-        let stored = export(&learner, &Default::default()).await;
+        let stored = export(&learner, &pb::TrajectoryFilter::default()).await;
         let stored = stored.into_iter().map(|t| (t.trajectory_id.clone(), t)).collect::<HashMap<_, _>>();
         for &number in &safe {
             let expected = trajectory(number);
@@ -83,7 +83,7 @@ async fn what_was_acknowledged_survives_kills() {
     }
     let service = Service::learner(data.path());
     let learner = Learner::connect(service.address()).await.expect("a learner");
-    let stored = export(&learner, &Default::default()).await;
+    let stored = export(&learner, &pb::TrajectoryFilter::default()).await;
     let ids = stored.iter().map(|t| t.trajectory_id.as_str()).collect::<std::collections::HashSet<_>>();
     assert_eq!(ids.len(), stored.len(), "no trajectory is stored twice");
     let stored = stored.iter().map(|t| (t.trajectory_id.clone(), t)).collect::<HashMap<_, _>>();
@@ -123,6 +123,6 @@ async fn a_recorder_goes_on_where_a_killed_learner_left_off() {
     assert_eq!(receipt.acknowledged(), total as u64);
     let service = again.join().expect("a service");
     let learner = Learner::connect(service.address()).await.expect("a learner");
-    let stored = export(&learner, &Default::default()).await;
+    let stored = export(&learner, &pb::TrajectoryFilter::default()).await;
     assert!(stored.iter().eq(&(0..total).map(trajectory).collect::<Vec<_>>()), "all, once, in the order recorded");
 }

@@ -20,7 +20,26 @@ use tonic::{Status, transport::Channel};
 use uuid::Uuid;
 
 /// Time within which anything here ends, unless it hangs.
-const PATIENCE: Duration = Duration::from_secs(60);
+const PATIENCE: Duration = Duration::from_mins(1);
+
+/// Makes a trajectory wrong.
+type TrajectoryChange = fn(&mut pb::Trajectory);
+/// Makes a model wrong.
+type ModelChange = fn(&mut Vec<ModelPart>);
+
+fn header(parts: &mut [ModelPart]) -> &mut mazeway_proto::env::ModelHeader {
+    match &mut parts[0].part {
+        Some(Part::Header(header)) => header,
+        _ => panic!("the first part is the header"),
+    }
+}
+
+fn rows(parts: &mut [ModelPart]) -> &mut mazeway_proto::env::RowBlock {
+    match &mut parts[1].part {
+        Some(Part::Rows(rows)) => rows,
+        _ => panic!("the second part is rows"),
+    }
+}
 
 fn start() -> (TempDir, LearnerServer) {
     let data = tempfile::tempdir().expect("a directory");
@@ -126,7 +145,7 @@ async fn every_request_is_answered_in_order_and_read_back_byte_for_byte() {
     end.expect("a stream that ends well");
     assert!(again.iter().all(|answer| answer.stored == 0 && answer.trajectory_ids.len() == 10));
     let learner = server.client().await;
-    assert_eq!(export(&learner, &Default::default()).await, requests.concat());
+    assert_eq!(export(&learner, &pb::TrajectoryFilter::default()).await, requests.concat());
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -155,15 +174,14 @@ async fn a_wrong_request_ends_the_stream_and_leaves_what_came_before() {
     let (answers, end) = record(&server, vec![vec![trajectory(5)], vec![trajectory(6), other]]).await;
     assert_eq!(answers.len(), 1);
     assert_eq!(blamed(end.expect_err("refused")), (Code::AlreadyExists, "trajectories[1].trajectory_id".into()));
-    let stored = export(&server.client().await, &Default::default()).await;
+    let stored = export(&server.client().await, &pb::TrajectoryFilter::default()).await;
     assert_eq!(stored, [0, 1, 2, 4, 5].map(trajectory));
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn each_wrong_field_of_a_trajectory_is_named() {
     let (_data, server) = start();
-    type Change = fn(&mut pb::Trajectory);
-    let cases: [(&str, Change); 12] = [
+    let cases: [(&str, TrajectoryChange); 12] = [
         ("trajectory_id", |t| t.trajectory_id = "7".into()),
         ("trajectory_id", |t| t.trajectory_id = Uuid::nil().simple().to_string()),
         ("env_id", |t| t.env_id.clear()),
@@ -233,7 +251,8 @@ async fn lists_come_in_pages_and_deletions_need_a_condition() {
             break;
         }
         // A token belongs to its filter.
-        let error = learner.list_trajectories_page(&Default::default(), 5, &token).await.expect_err("refused");
+        let error =
+            learner.list_trajectories_page(&pb::TrajectoryFilter::default(), 5, &token).await.expect_err("refused");
         assert_eq!(blame(&error), (Code::InvalidArgument, "page_token".into()));
     }
     assert_eq!(listed, expected);
@@ -243,10 +262,10 @@ async fn lists_come_in_pages_and_deletions_need_a_condition() {
     let error = learner.list_trajectories(&wrong).await.expect_err("refused");
     assert_eq!(blame(&error), (Code::InvalidArgument, "filter.trajectory_ids[0]".into()));
 
-    let error = learner.delete_trajectories(&Default::default()).await.expect_err("refused");
+    let error = learner.delete_trajectories(&pb::TrajectoryFilter::default()).await.expect_err("refused");
     assert_eq!(blame(&error), (Code::InvalidArgument, "filter".into()));
     assert_eq!(learner.delete_trajectories(&filter).await.expect("deleted"), expected.len() as u64);
-    assert_eq!(learner.count_trajectories(&Default::default()).await.expect("a count"), 9);
+    assert_eq!(learner.count_trajectories(&pb::TrajectoryFilter::default()).await.expect("a count"), 9);
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -263,20 +282,7 @@ async fn models_are_verified_named_and_stored_once() {
     assert_eq!(listed[0].n_transitions, model.probabilities.len() as u64);
     assert!(learner.list_models("Other-v0").await.expect("models").is_empty());
 
-    type Change = fn(&mut Vec<ModelPart>);
-    fn header(parts: &mut [ModelPart]) -> &mut mazeway_proto::env::ModelHeader {
-        match &mut parts[0].part {
-            Some(Part::Header(header)) => header,
-            _ => panic!("the first part is the header"),
-        }
-    }
-    fn rows(parts: &mut [ModelPart]) -> &mut mazeway_proto::env::RowBlock {
-        match &mut parts[1].part {
-            Some(Part::Rows(rows)) => rows,
-            _ => panic!("the second part is rows"),
-        }
-    }
-    let cases: [(&str, Change); 13] = [
+    let cases: [(&str, ModelChange); 13] = [
         ("part", |p| p[0].part = None),
         ("part.header", |p| p.clear()),
         ("part.header", |p| p.insert(1, p[0].clone())),
@@ -530,13 +536,13 @@ async fn a_stop_loses_nothing_that_was_acknowledged() {
     assert!(acknowledged > 0 && recorder.unacknowledged() > 0);
     tokio::task::spawn_blocking(move || server.stop()).await.expect("a stop");
     let server = LearnerServer::at(address, data.path(), Limits::default());
-    let stored = export(&server.client().await, &Default::default()).await;
+    let stored = export(&server.client().await, &pb::TrajectoryFilter::default()).await;
     assert!(stored.len() as u64 >= acknowledged);
     assert!(stored.iter().enumerate().all(|(i, t)| *t == trajectory(i as u128)));
     // The recorder goes on where the other left off.
     let receipt = timeout(PATIENCE, recorder.finish()).await.expect("an end").expect("everything stored");
     assert_eq!(receipt.acknowledged(), 10_000);
-    assert_eq!(export(&server.client().await, &Default::default()).await.len(), 10_000);
+    assert_eq!(export(&server.client().await, &pb::TrajectoryFilter::default()).await.len(), 10_000);
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -556,7 +562,7 @@ async fn a_recorder_gives_up_what_is_refused_and_nothing_else() {
     assert!(error.to_string().contains(&id), "{error}");
     let receipt = recorder.finish().await.expect("the others are stored");
     assert_eq!((receipt.stored, receipt.duplicates), (3, 0));
-    let stored = export(&server.client().await, &Default::default()).await;
+    let stored = export(&server.client().await, &pb::TrajectoryFilter::default()).await;
     assert_eq!(stored, [1, 2, 3].map(trajectory));
 }
 

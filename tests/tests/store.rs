@@ -36,7 +36,8 @@ async fn write_the_sample() {
         recorder.record(sampled(number, &model.model_id)).await.expect("a trajectory");
     }
     recorder.finish().await.expect("everything stored");
-    let request = pb::FitRequest { method: "em".into(), filter: Some(Default::default()), ..Default::default() };
+    let request =
+        pb::FitRequest { method: "em".into(), filter: Some(pb::TrajectoryFilter::default()), ..Default::default() };
     learner.fit(request, |_| ()).await.expect("a fit");
     drop(learner);
     server.stop();
@@ -53,7 +54,7 @@ async fn a_store_of_the_first_release_reads_and_goes_on() {
     assert_eq!(models.len(), 1);
     assert_eq!((models[0].env_id.as_str(), models[0].n_states, models[0].n_actions), ("Maze-v0", 57, 4));
     let expected = (0..SAMPLE).map(|number| sampled(number, &models[0].model_id)).collect::<Vec<_>>();
-    assert_eq!(export(&learner, &Default::default()).await, expected);
+    assert_eq!(export(&learner, &pb::TrajectoryFilter::default()).await, expected);
     let fits = learner.list_fits("", "").await.expect("fits");
     assert_eq!(fits.len(), 1);
     let old = learner.get_fit(&fits[0].fit_id).await.expect("a fit");
@@ -110,7 +111,7 @@ async fn two_processes_share_a_directory() {
     let mut seen = Vec::new();
     for service in &services {
         let learner = Learner::connect(service.address()).await.expect("a learner");
-        seen.push(export(&learner, &Default::default()).await);
+        seen.push(export(&learner, &pb::TrajectoryFilter::default()).await);
     }
     assert_eq!(seen[0].len(), 900);
     assert!(seen[0] == seen[1], "both see the same, in the same order");

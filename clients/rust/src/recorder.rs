@@ -361,10 +361,12 @@ mod tests {
         }
     }
 
+    /// Makes a demonstration wrong.
+    type Change = fn(&mut Demonstration);
+
     #[test]
     fn what_is_no_trajectory_is_refused_before_it_travels() {
         assert!(check(&demonstration().into()).is_ok());
-        type Change = fn(&mut Demonstration);
         let cases: [(&str, Change); 5] = [
             ("states", |d| d.states.clear()),
             ("states", |d| d.states[1] = 3),

@@ -184,7 +184,9 @@ fn fit_text(fit: &pb::Fit) -> Result<String, CliError> {
         ("version", fit.version.clone()),
     ]);
     for warning in &fit.warnings {
-        text.push_str(&format!("warning: {warning}\n"));
+        text.push_str("warning: ");
+        text.push_str(warning);
+        text.push('\n');
     }
     let visits = array(&fit.state_visits, s, "the state visits")?;
     let values = array(&fit.state_values, s, "the state values")?;

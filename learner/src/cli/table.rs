@@ -33,7 +33,8 @@ pub fn table<const N: usize>(header: [&str; N], rows: impl IntoIterator<Item = [
 pub fn facts(rows: impl IntoIterator<Item = (&'static str, String)>) -> String {
     let rows = rows.into_iter().filter(|(_, value)| !value.is_empty()).collect::<Vec<_>>();
     let width = rows.iter().map(|(name, _)| name.chars().count()).max().unwrap_or(0);
-    rows.into_iter().map(|(name, value)| format!("{name:<width$}  {value}\n")).collect()
+    let lines = rows.into_iter().map(|(name, value)| format!("{name:<width$}  {value}\n"));
+    lines.collect::<Vec<_>>().concat()
 }
 
 /// A time in UTC, to the second.

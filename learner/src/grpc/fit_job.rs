@@ -75,7 +75,7 @@ impl FitJob {
         let asked = if self.request.model_id.is_empty() { None } else { Some(load(&self.request.model_id)?) };
         let data = self.gather(store, cancelled)?;
         let model = asked.map_or_else(|| load(&data.model_id), Ok)?;
-        self.check_sizes(&model, &data)?;
+        check_sizes(&model, &data)?;
         let mdp = mdp(&model)?;
         let problem = Problem {
             mdp: &mdp,
@@ -111,19 +111,6 @@ impl FitJob {
         gathering.finish()
     }
 
-    fn check_sizes(&self, model: &Model, data: &Data) -> Result<(), CallError> {
-        let (n_states, n_actions) = (model.header().n_states as usize, model.header().n_actions as usize);
-        let (s, a) = (data.statistics.n_states(), data.statistics.n_actions());
-        if (n_states, n_actions) == (s, a) {
-            return Ok(());
-        }
-        let message = format!(
-            "expected a model of {s} states and {a} actions as the trajectories have, got {n_states} states and \
-             {n_actions} actions"
-        );
-        Err(CallError::field("model_id", message))
-    }
-
     fn describe(self, model: &Model, data: Data, fit: &irl::Fit, fit_secs: f64) -> pb::Fit {
         let counts = data.statistics.counts(None);
         pb::Fit {
@@ -155,6 +142,20 @@ impl FitJob {
             request: Some(self.request),
         }
     }
+}
+
+/// Model and data must belong to processes of one size.
+fn check_sizes(model: &Model, data: &Data) -> Result<(), CallError> {
+    let (n_states, n_actions) = (model.header().n_states as usize, model.header().n_actions as usize);
+    let (s, a) = (data.statistics.n_states(), data.statistics.n_actions());
+    if (n_states, n_actions) == (s, a) {
+        return Ok(());
+    }
+    let message = format!(
+        "expected a model of {s} states and {a} actions as the trajectories have, got {n_states} states and \
+         {n_actions} actions"
+    );
+    Err(CallError::field("model_id", message))
 }
 
 /// One iteration on the wire.

@@ -61,7 +61,7 @@ impl ModelBuilder {
         ];
         for (field, part, whole, size, limit) in arrays {
             let got = (whole.len() + part.len()) as u64 / size;
-            if part.len() as u64 % size != 0 || got > limit {
+            if !(part.len() as u64).is_multiple_of(size) || got > limit {
                 let message = format!("expected {size} bytes an entry and {limit} entries in all at most, got {got}");
                 return Err(CallError::field(format!("part.rows.{field}"), message));
             }

@@ -13,7 +13,7 @@ use mazeway_proto::env::ModelHeader;
 use prost::Message as _;
 use rusqlite::{Connection, OptionalExtension, params};
 use sha2::{Digest, Sha256};
-use std::path::Path;
+use std::{fmt::Write as _, path::Path};
 
 /// Version of the header's encoding: a protocol buffer message behind this byte.
 const DOCUMENT_VERSION: u8 = 1;
@@ -208,7 +208,12 @@ fn model_id(header: &ModelHeader, rows: &Rows) -> String {
         }
         hash.update(&bytes);
     }
-    hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
+    let mut hexadecimal = String::with_capacity(64);
+    for byte in hash.finalize() {
+        // Writing to a string cannot fail.
+        let _ = write!(hexadecimal, "{byte:02x}");
+    }
+    hexadecimal
 }
 
 /// Stores a model. `Ok(false)`: it is stored already.

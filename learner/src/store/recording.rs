@@ -94,7 +94,7 @@ impl Recording {
             }
         }
         let steps = arrays.states.len() / 4;
-        if steps == 0 || arrays.states.len() % 4 != 0 {
+        if steps == 0 || !arrays.states.len().is_multiple_of(4) {
             let message = format!("expected 4 bytes a step and at least one step, got {} bytes", arrays.states.len());
             return Err(FieldError::new("states", message));
         }
@@ -257,6 +257,9 @@ pub fn pack_f64(values: &[f64]) -> Bytes {
 mod tests {
     use super::*;
 
+    /// Breaks an invariant.
+    type Break = fn(&mut Collection, &mut Arrays);
+
     fn parts() -> (Uuid, Collection, Option<u64>, Arrays) {
         let collection = Collection {
             env_id: "Maze-v0".into(),
@@ -278,8 +281,7 @@ mod tests {
 
     #[test]
     fn each_broken_invariant_names_its_field() {
-        type Change = fn(&mut Collection, &mut Arrays);
-        let cases: [(&str, Change); 14] = [
+        let cases: [(&str, Break); 14] = [
             ("env_id", |c, _| c.env_id.clear()),
             ("env_id", |c, _| c.env_id = "x".repeat(201)),
             ("style", |c, _| c.style.clear()),
@@ -310,8 +312,7 @@ mod tests {
         let other_id = Recording::new(Uuid::from_u128(8), collection.clone(), seed, arrays.clone()).unwrap();
         assert_eq!(first.content_hash(), other_id.content_hash());
         let mut hashes = vec![first.content_hash()];
-        type Change = fn(&mut Collection, &mut Option<u64>, &mut Arrays);
-        let changes: [Change; 14] = [
+        let changes: [fn(&mut Collection, &mut Option<u64>, &mut Arrays); 14] = [
             |c, _, _| c.env_id = "x".into(),
             |c, _, _| c.model_id = "0".repeat(64),
             |c, _, _| c.style = "x".into(),

@@ -10,6 +10,9 @@ use rusqlite::{Connection, OptionalExtension, Row, params, params_from_iter, typ
 use std::{collections::HashMap, path::Path};
 use uuid::Uuid;
 
+/// What [`Cursor::page`] reads of a row.
+const COLUMNS: &str =
+    "seq, trajectory_id, collection, seed, final_state, terminated, truncated, states, actions, rewards";
 /// Rows that a page of whole trajectories holds at most.
 const PAGE_ROWS: usize = 512;
 
@@ -44,13 +47,12 @@ pub(super) fn insert(
     let fail = |e: rusqlite::Error| StoreError::from_sqlite(path, &e);
     let hash = recording.content_hash();
     let id = recording.id().to_string();
-    let collection = match cache.get(recording.collection()) {
-        Some(&id) => id,
-        None => {
-            let id = collection_id(connection, recording.collection()).map_err(fail)?;
-            cache.insert(recording.collection().clone(), id);
-            id
-        }
+    let collection = if let Some(&id) = cache.get(recording.collection()) {
+        id
+    } else {
+        let id = collection_id(connection, recording.collection()).map_err(fail)?;
+        cache.insert(recording.collection().clone(), id);
+        id
     };
     let arrays = recording.arrays();
     let inserted = connection
@@ -194,8 +196,6 @@ impl Cursor {
         max_bytes: usize,
     ) -> Result<Vec<Recording>, StoreError> {
         let fail = |e: rusqlite::Error| StoreError::from_sqlite(path, &e);
-        const COLUMNS: &str =
-            "seq, trajectory_id, collection, seed, final_state, terminated, truncated, states, actions, rewards";
         let (sql, values): (String, Vec<Value>) = match &self.place {
             Place::Scan { filter, after, last } => {
                 let mut condition = Condition::new(connection, filter).map_err(fail)?;

@@ -10,7 +10,19 @@ use tokio::net::TcpListener;
 use tracing_subscriber::EnvFilter;
 
 fn main() -> ExitCode {
-    let cli = Cli::parse();
+    let cli = match Cli::try_parse() {
+        Ok(cli) => cli,
+        Err(error) if !error.use_stderr() => {
+            // Help and version; a closed pipe while printing them is nobody's failure.
+            let _ = error.print();
+            return ExitCode::SUCCESS;
+        }
+        Err(error) => {
+            let text = error.to_string();
+            let message = text.lines().next().unwrap_or_default();
+            return refuse(2, message.strip_prefix("error: ").unwrap_or(message), "see 'server --help'");
+        }
+    };
     let filter = EnvFilter::try_from_env("MAZEWAY_LOG").unwrap_or_else(|_| EnvFilter::new("warn"));
     tracing_subscriber::fmt().with_env_filter(filter).with_writer(io::stderr).init();
     if !cli.listen.ip().is_loopback() && !cli.insecure {

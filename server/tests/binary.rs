@@ -84,6 +84,10 @@ fn wrong_arguments_exit_with_2() {
     for wrong in [&["--port", "1"][..], &["--listen", "nowhere"], &["--default-lease-secs", "-3"], &["extra"]] {
         let (code, text) = fails(&mut server(wrong));
         assert_eq!(code, Some(2), "{text}");
-        assert!(text.starts_with("error: "), "{text}");
+        let lines: Vec<_> = text.lines().collect();
+        assert!(
+            matches!(lines[..], [error, hint] if error.starts_with("error: ") && hint.starts_with("hint: ")),
+            "{text}"
+        );
     }
 }

@@ -20,12 +20,16 @@ pub fn program(name: &str) -> PathBuf {
         let profile = if profile == "debug" { "dev" } else { profile.to_str().expect("a name in UTF-8") };
         let mut cargo = Command::new(env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
         cargo.args(["build", "--quiet", "--workspace", "--bin", "server", "--bin", "learner", "--profile", profile]);
+        // With a test among the targets, dependencies have the features that they have in `cargo test --workspace`: what
+        // that has built need not be built again.
+        cargo.args(["--test", "kill"]);
         cargo.args(["--message-format", "json-render-diagnostics"]).current_dir(env!("CARGO_MANIFEST_DIR"));
         let output = cargo.stderr(Stdio::inherit()).output().expect("cargo");
         assert!(output.status.success(), "{cargo:?}: {}", output.status);
         String::from_utf8_lossy(&output.stdout)
             .lines()
             .filter_map(|line| serde_json::from_str::<serde_json::Value>(line).ok())
+            .filter(|message| message["target"]["kind"][0] == "bin")
             .filter_map(|message| Some(PathBuf::from(message.get("executable")?.as_str()?)))
             .find_map(|program| Some(program.parent()?.to_path_buf()))
             .expect("the path of a program")

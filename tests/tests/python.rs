@@ -4,13 +4,13 @@
 //! Needs Python 3.10 or later with `venv` (`PYTHON` names another than `python3`) and, for the first run, a package
 //! index. An environment is made anew when the requirements change; runs that share a target directory take turns.
 
+use mazeway_tests::programs::program;
 use prost::Message as _;
 use std::{
     env, fs,
     fs::File,
     path::{Path, PathBuf},
     process::{Command, Stdio},
-    sync::OnceLock,
     thread,
     time::{Duration, Instant},
 };
@@ -99,7 +99,9 @@ impl Venv {
         let scripts = self.directory.join(if cfg!(windows) { "Scripts" } else { "bin" });
         let mut command = Command::new(scripts.join("python"));
         command.arg("-m").arg(module).args(arguments).current_dir(package());
-        command.env("MAZEWAY_BIN_DIR", programs()).env("PYTHONDONTWRITEBYTECODE", "1");
+        command
+            .env("MAZEWAY_BIN_DIR", program("server").parent().expect("a directory"))
+            .env("PYTHONDONTWRITEBYTECODE", "1");
         command.env("PIP_DISABLE_PIP_VERSION_CHECK", "1").env("RUFF_NO_CACHE", "true");
         finish(&mut command, &self.directory.with_extension("log"))
     }
@@ -129,25 +131,4 @@ fn finish(command: &mut Command, log: &Path) -> String {
         None => panic!("{command:?}: no end after {PATIENCE:?}\n{said}"),
     }
     said
-}
-
-/// Directory of the programs `server` and `learner`, built from the present sources in this test's own profile.
-fn programs() -> &'static Path {
-    static DIRECTORY: OnceLock<PathBuf> = OnceLock::new();
-    DIRECTORY.get_or_init(|| {
-        let own = env::current_exe().expect("a path of this test");
-        let profile = own.ancestors().nth(2).and_then(Path::file_name).expect("a profile's directory");
-        let profile = if profile == "debug" { "dev" } else { profile.to_str().expect("a name in UTF-8") };
-        let mut cargo = Command::new(env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
-        cargo.args(["build", "--quiet", "--workspace", "--bin", "server", "--bin", "learner", "--profile", profile]);
-        cargo.args(["--message-format", "json-render-diagnostics"]).current_dir(env!("CARGO_MANIFEST_DIR"));
-        let output = cargo.stderr(Stdio::inherit()).output().expect("cargo");
-        assert!(output.status.success(), "{cargo:?}: {}", output.status);
-        String::from_utf8_lossy(&output.stdout)
-            .lines()
-            .filter_map(|line| serde_json::from_str::<serde_json::Value>(line).ok())
-            .filter_map(|message| Some(PathBuf::from(message.get("executable")?.as_str()?)))
-            .find_map(|program| Some(program.parent()?.to_path_buf()))
-            .expect("the path of a program")
-    })
 }

@@ -23,38 +23,38 @@ impl Narrator {
     }
 
     /// One thing that was done.
-    pub fn step(&self, what: &str, detail: impl std::fmt::Display) -> io::Result<()> {
+    pub fn step(self, what: &str, detail: impl std::fmt::Display) -> io::Result<()> {
         self.line(format_args!("{what:<12}{detail}"))
     }
 
     /// One line of text, or several.
-    pub fn line(&self, text: impl std::fmt::Display) -> io::Result<()> {
+    pub fn line(self, text: impl std::fmt::Display) -> io::Result<()> {
         if self.quiet { Ok(()) } else { writeln!(io::stdout().lock(), "{text}") }
     }
 
     /// A bar of known length.
-    pub fn bar(&self, what: &'static str, length: u64) -> ProgressBar {
+    pub fn bar(self, what: &'static str, length: u64) -> ProgressBar {
         let style = ProgressStyle::with_template("{prefix:<12}{bar:40} {pos}/{len} {msg} {eta}")
             .unwrap_or_else(|_| ProgressStyle::default_bar());
-        self.styled(ProgressBar::with_draw_target(Some(length), self.target()), what, style)
+        styled(ProgressBar::with_draw_target(Some(length), self.target()), what, style)
     }
 
     /// A spinner for work of unknown length.
-    pub fn spinner(&self, what: &'static str) -> ProgressBar {
+    pub fn spinner(self, what: &'static str) -> ProgressBar {
         let style = ProgressStyle::with_template("{prefix:<12}{spinner} {msg} {elapsed}")
             .unwrap_or_else(|_| ProgressStyle::default_spinner());
-        let bar = self.styled(ProgressBar::with_draw_target(None, self.target()), what, style);
+        let bar = styled(ProgressBar::with_draw_target(None, self.target()), what, style);
         bar.enable_steady_tick(Duration::from_millis(120));
-        bar
-    }
-
-    fn styled(self, bar: ProgressBar, what: &'static str, style: ProgressStyle) -> ProgressBar {
-        bar.set_style(style);
-        bar.set_prefix(what);
         bar
     }
 
     fn target(self) -> ProgressDrawTarget {
         if self.bars { ProgressDrawTarget::stderr() } else { ProgressDrawTarget::hidden() }
     }
+}
+
+fn styled(bar: ProgressBar, what: &'static str, style: ProgressStyle) -> ProgressBar {
+    bar.set_style(style);
+    bar.set_prefix(what);
+    bar
 }

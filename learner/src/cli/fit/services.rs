@@ -34,15 +34,14 @@ impl Services {
     pub async fn start(args: &FitArgs, narrator: Narrator) -> Result<Self, CliError> {
         let mut running = Vec::new();
         let data = data_directory(args.store.data.clone())?;
-        let learner_address = match &args.store.addr {
-            Some(address) => address.clone(),
-            None => {
-                let learner = embedded::learner(&data).await?;
-                let address = learner.address();
-                running.push(learner);
-                narrator.step("started", format_args!("learner service at {address}, data in {}", data.display()))?;
-                address
-            }
+        let learner_address = if let Some(address) = &args.store.addr {
+            address.clone()
+        } else {
+            let learner = embedded::learner(&data).await?;
+            let address = learner.address();
+            running.push(learner);
+            narrator.step("started", format_args!("learner service at {address}, data in {}", data.display()))?;
+            address
         };
         let environments_address = match (&args.env_addr, &args.store.addr) {
             (Some(address), _) => address.clone(),
@@ -96,16 +95,14 @@ impl Services {
     /// There is none of that name.
     pub async fn spec(&self, env_id: &str) -> Result<EnvSpec, CliError> {
         let mut specs = self.environments.list_environments().await?;
-        match specs.iter().position(|spec| spec.env_id == env_id) {
-            Some(rank) => Ok(specs.swap_remove(rank)),
-            None => {
-                let known: Vec<_> = specs.iter().map(|spec| spec.env_id.as_str()).collect();
-                Err(CliError::usage(
-                    format!("unknown environment '{env_id}' for --env"),
-                    format!("choose one of {}", known.join(", ")),
-                ))
-            }
+        if let Some(rank) = specs.iter().position(|spec| spec.env_id == env_id) {
+            return Ok(specs.swap_remove(rank));
         }
+        let known: Vec<_> = specs.iter().map(|spec| spec.env_id.as_str()).collect();
+        Err(CliError::usage(
+            format!("unknown environment '{env_id}' for --env"),
+            format!("choose one of {}", known.join(", ")),
+        ))
     }
 
     /// The environment's tabular model.

@@ -1,7 +1,7 @@
 //! What a person sees at the end of a fit: plain data, and what is drawn from them.
 //!
 //! [`Report`] is filled by whoever ran the fit. From it come the object for programs ([`json`]), the tables of a
-//! terminal ([`table`]), the pictures ([`pictures`]), the page ([`html`]) and the directory with all of them ([`write`]).
+//! terminal ([`table`]), the pictures ([`pictures`]), the page ([`html`]) and the directory with all of them ([`mod@write`]).
 //! Invariants: everything here is a function of the report alone (no clock, no randomness, no map order); a number that is
 //! not finite is drawn as missing, never printed as a number; text that came from a user is escaped wherever it lands.
 //! Deliberately absent: any computation of what is reported.

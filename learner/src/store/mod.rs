@@ -5,7 +5,7 @@
 //! with the data; several processes may use a directory at once. Trajectories are kept raw: what a method needs of them
 //! depends on the discount and the horizon, and is derived when it is needed.
 //!
-//! Deliberately absent: the wire (see [`crate::grpc`]), and any change of what is stored; there is recording and
+//! Deliberately absent: the wire (see `grpc`), and any change of what is stored; there is recording and
 //! deleting.
 
 mod error;

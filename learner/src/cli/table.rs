@@ -60,7 +60,7 @@ mod tests {
     fn numbers_stand_to_the_right() {
         let text = table(["name", "#count"], [["a".into(), "1".into()], ["bcd".into(), "1000".into()]]);
         let lines = text.lines().map(str::trim_end).collect::<Vec<_>>();
-        assert_eq!(lines, [" name  count", "─────────────", " a         1", " bcd    1000"]);
+        assert_eq!(lines, [" name   count", "──────────────", " a          1", " bcd     1000"]);
     }
 
     #[test]

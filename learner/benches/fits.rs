@@ -15,8 +15,13 @@ fn fits(criterion: &mut Criterion) {
     let demonstrations = maze::simulate(&maze, 100, 50, 0);
     let statistics = maze::statistics(&demonstrations);
     let options = FitOptions::default();
-    let problem =
-        Problem { mdp: &maze.mdp, options: &options, statistics: &statistics, demonstrations: Some(&demonstrations) };
+    let problem = Problem {
+        mdp: &maze.mdp,
+        options: &options,
+        statistics: &statistics,
+        demonstrations: Some(&demonstrations),
+        features: None,
+    };
     for id in ["em", "em-tied", "bc"] {
         let method = irl::method(id).expect("a method");
         criterion.bench_function(&format!("maze/{id}"), |bencher| {

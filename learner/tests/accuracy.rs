@@ -21,6 +21,7 @@ fn mean_agreement(maze: &Maze, method: &str, trajectories: usize) -> f64 {
                 options: &options,
                 statistics: &statistics,
                 demonstrations: Some(&demonstrations),
+                features: None,
             };
             let fit = irl::method(method)
                 .expect("a method")

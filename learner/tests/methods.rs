@@ -7,16 +7,21 @@ use mazeway_learner::irl::{
     self, Basis, BasisKind, Fit, FitError, FitOptions, HorizonPrior, METHODS, MStep, Penalty, PlannerKind, Problem,
     Responsibility, Stopped,
 };
-use mazeway_learner::mdp::TabularMdp;
+use mazeway_learner::mdp::{Features, TabularMdp};
 use mazeway_learner::statistics::Statistics;
 use mazeway_learner::trajectory::{Demonstrations, Trajectory};
 use proptest::prelude::*;
 use random::{below, episodes, generator, mdp, permutation, permuted, policy, statistics, vector};
 use std::ops::ControlFlow;
 
+fn table(mdp: &TabularMdp, n_features: usize, values: &[f64]) -> Features {
+    let names = (0..n_features).map(|f| format!("f{f}")).collect();
+    Features::of_pairs(mdp.n_pairs(), names, values).expect("features")
+}
+
 fn fit(id: &str, mdp: &TabularMdp, data: &Demonstrations, options: &FitOptions) -> Result<Fit, FitError> {
     let statistics = statistics(mdp, data);
-    let problem = Problem { mdp, options, statistics: &statistics, demonstrations: Some(data) };
+    let problem = Problem { mdp, options, statistics: &statistics, demonstrations: Some(data), features: None };
     irl::method(id).expect("a method").fit(&problem, &mut |_| ControlFlow::Continue(()))
 }
 
@@ -42,7 +47,7 @@ fn random_options(random: &mut rand_pcg::Pcg64) -> FitOptions {
             random,
         ),
         penalty: pick(&[Penalty::L1, Penalty::L2, Penalty::None], random),
-        penalty_strength: pick(&[0.0, 0.01, 1.0, 100.0], random),
+        penalty_strength: Some(pick(&[0.0, 0.01, 1.0, 100.0], random)),
         smoothing: pick(&[0.0, 1.0], random),
         max_iterations: 200,
         ..FitOptions::default()
@@ -82,7 +87,7 @@ proptest! {
         let basis = match kind {
             0 => Basis::state(&mdp),
             1 => Basis::state_action(&mdp),
-            _ => Basis::features(&mdp, 3, &vector(n * a * 3, &mut random)).expect("a basis"),
+            _ => Basis::features(&table(&mdp, 3, &vector(n * a * 3, &mut random))),
         };
         let counts = statistics(&mdp, &data).counts(None);
         let mut likelihood = Likelihood::new(&mdp, &basis, counts, discount);
@@ -122,7 +127,7 @@ proptest! {
         }).collect();
         let reference = below(n, &mut random);
         for (id, m_step) in [("em", MStep::Nnls), ("em", MStep::Simplex), ("em-mixture", MStep::Nnls), ("em-tied", MStep::Nnls), ("bc", MStep::Nnls)] {
-            let options = FitOptions { m_step, reference_basis: reference as u32, tolerance: 1e-9, penalty_strength: 0.5, ..FitOptions::default() };
+            let options = FitOptions { m_step, reference_basis: reference as u32, tolerance: 1e-9, penalty_strength: Some(0.5), ..FitOptions::default() };
             let found = fit(id, &original, &data, &options).expect("a fit");
             let options = FitOptions { reference_basis: order[reference] as u32, ..options };
             let moved = fit(id, &renamed, &renamed_data, &options).expect("a fit");
@@ -207,7 +212,7 @@ fn bus(bins: usize) -> (TabularMdp, Basis) {
     }
     let mdp = TabularMdp::new(bins, 2, offsets, next, probabilities, None).expect("a model");
     let features: Vec<f64> = (0..bins).flat_map(|m| [-0.001 * m as f64, 0.0, 0.0, -1.0]).collect();
-    let basis = Basis::features(&mdp, 2, &features).expect("a basis");
+    let basis = Basis::features(&table(&mdp, 2, &features));
     (mdp, basis)
 }
 
@@ -228,7 +233,8 @@ fn dynamic_discrete_choice_is_recovered_at_a_discount_of_0_9999() {
         let data: Demonstrations =
             (0..60).flat_map(|_| episodes(&mdp, &policy, 1, 400, &mut random).trajectories().to_vec()).collect();
         let statistics = statistics(&mdp, &data);
-        let problem = Problem { mdp: &mdp, options: &options, statistics: &statistics, demonstrations: None };
+        let problem =
+            Problem { mdp: &mdp, options: &options, statistics: &statistics, demonstrations: None, features: None };
         let found = fit_with_basis(&problem, &basis, &mut |_| ControlFlow::Continue(())).expect("a fit");
         assert_eq!(found.stopped, Stopped::Converged);
         assert!(found.warnings.is_empty(), "{:?}", found.warnings);
@@ -255,12 +261,13 @@ fn an_undetermined_weight_has_an_infinite_standard_error() {
     let (mdp, _) = bus(20);
     // a constant changes no choice; the cost of a replacement does
     let features: Vec<f64> = (0..20).flat_map(|_| [1.0, 0.0, 1.0, -1.0]).collect();
-    let basis = Basis::features(&mdp, 2, &features).expect("a basis");
+    let basis = Basis::features(&table(&mdp, 2, &features));
     let mut random = generator(3);
     let data = episodes(&mdp, &policy(20, 2, &mut random), 40, 50, &mut random);
     let statistics = statistics(&mdp, &data);
     let options = FitOptions { penalty: Penalty::None, ..FitOptions::default() };
-    let problem = Problem { mdp: &mdp, options: &options, statistics: &statistics, demonstrations: None };
+    let problem =
+        Problem { mdp: &mdp, options: &options, statistics: &statistics, demonstrations: None, features: None };
     let found = fit_with_basis(&problem, &basis, &mut |_| ControlFlow::Continue(())).expect("a fit");
     let errors = found.standard_errors.expect("standard errors");
     assert!(errors[0].is_infinite() && errors[1].is_finite() && errors[1] > 0.0, "{errors:?}");
@@ -346,7 +353,7 @@ fn wrong_options_are_named() {
         ("horizon", FitOptions { horizon: Some(0), ..base.clone() }),
         ("max_iterations", FitOptions { max_iterations: 0, ..base.clone() }),
         ("tolerance", FitOptions { tolerance: f64::NAN, ..base.clone() }),
-        ("penalty_strength", FitOptions { penalty_strength: -1.0, ..base.clone() }),
+        ("penalty_strength", FitOptions { penalty_strength: Some(-1.0), ..base.clone() }),
         ("smoothing", FitOptions { smoothing: f64::INFINITY, ..base.clone() }),
     ];
     for (name, options) in &wrong {
@@ -369,7 +376,7 @@ fn wrong_options_are_named() {
     let other = other.finish().expect("counts");
     assert!(statistics.finish().is_err());
     for method in METHODS {
-        let problem = Problem { mdp: &mdp, options: &base, statistics: &other, demonstrations: None };
+        let problem = Problem { mdp: &mdp, options: &base, statistics: &other, demonstrations: None, features: None };
         let error = method.fit(&problem, &mut |_| ControlFlow::Continue(())).expect_err("a refusal");
         assert!(matches!(error, FitError::Mismatch { .. }), "{}: {error}", method.id());
     }
@@ -383,7 +390,13 @@ fn the_caller_can_cancel() {
     let statistics = statistics(&mdp, &data);
     let options = FitOptions::default();
     for method in METHODS {
-        let problem = Problem { mdp: &mdp, options: &options, statistics: &statistics, demonstrations: Some(&data) };
+        let problem = Problem {
+            mdp: &mdp,
+            options: &options,
+            statistics: &statistics,
+            demonstrations: Some(&data),
+            features: None,
+        };
         let mut calls = 0;
         let cancelled = method.fit(&problem, &mut |_| {
             calls += 1;
@@ -392,7 +405,8 @@ fn the_caller_can_cancel() {
         assert_eq!(cancelled, Err(FitError::Cancelled), "{}", method.id());
         assert_eq!(calls, 1, "{}", method.id());
     }
-    let problem = Problem { mdp: &mdp, options: &options, statistics: &statistics, demonstrations: None };
+    let problem =
+        Problem { mdp: &mdp, options: &options, statistics: &statistics, demonstrations: None, features: None };
     let mut go_on = |_: &irl::TraceEntry| ControlFlow::Continue(());
     let error = irl::method("em-mixture").expect("a method").fit(&problem, &mut go_on).expect_err("a refusal");
     assert!(matches!(error, FitError::NeedsDemonstrations { .. }));

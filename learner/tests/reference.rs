@@ -25,7 +25,13 @@ fn fit(method: &str, options: &FitOptions) -> Fit {
     let maze = maze();
     let demonstrations = demonstrations();
     let statistics = statistics(&demonstrations);
-    let problem = Problem { mdp: &maze.mdp, options, statistics: &statistics, demonstrations: Some(&demonstrations) };
+    let problem = Problem {
+        mdp: &maze.mdp,
+        options,
+        statistics: &statistics,
+        demonstrations: Some(&demonstrations),
+        features: None,
+    };
     irl::method(method).expect("a method").fit(&problem, &mut |_| ControlFlow::Continue(())).expect("a fit")
 }
 
@@ -50,7 +56,7 @@ fn methods_reproduce_all_fits() {
         if let Some(constraint) = case["weights_constraint"].as_str() {
             options.tolerance = 1e-10;
             if constraint.starts_with("free") {
-                (options.penalty, options.penalty_strength) = (Penalty::L2, 0.1);
+                (options.penalty, options.penalty_strength) = (Penalty::L2, Some(0.1));
             }
         }
         if method == "em-mixture" {

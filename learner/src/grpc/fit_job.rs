@@ -82,9 +82,10 @@ impl FitJob {
             options: &self.options,
             statistics: &data.statistics,
             demonstrations: data.demonstrations.as_ref(),
+            features: None,
         };
         let begun = Instant::now();
-        let fit = self.method.fit(&problem, &mut progress).map_err(refused)?;
+        let fit = irl::fit(self.method, &problem, &mut progress).map_err(refused)?;
         Ok(self.describe(&model, data, &fit, begun.elapsed().as_secs_f64()))
     }
 

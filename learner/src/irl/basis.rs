@@ -1,6 +1,6 @@
 //! Basis functions Φ(s,a) of the reward R = wᵀΦ.
 
-use crate::mdp::TabularMdp;
+use crate::mdp::{Features, TabularMdp};
 
 /// Φ, one sparse row a state-action pair.
 #[derive(Debug, Clone, PartialEq)]
@@ -16,33 +16,8 @@ enum Kind {
     State { n_actions: usize },
     /// Φ_b(s,a) = [(s,a) = b].
     StateAction,
-    /// Entries that are not zero, row by row.
-    Features { offsets: Vec<usize>, columns: Vec<u32>, values: Vec<f64> },
-}
-
-/// Why a table is not a basis.
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub enum BasisError {
-    /// Wrong number of entries.
-    #[error(
-        "expected a feature table of {n_pairs} rows and {n_basis} columns with at least one column, got {got} entries"
-    )]
-    Shape {
-        /// Number of state-action pairs.
-        n_pairs: usize,
-        /// Number of features.
-        n_basis: usize,
-        /// What came.
-        got: usize,
-    },
-    /// Not a number.
-    #[error("expected finite features, got {value} in row {row}")]
-    NotFinite {
-        /// State-action pair.
-        row: usize,
-        /// What came.
-        value: f64,
-    },
+    /// A user's table.
+    Features(Features),
 }
 
 impl Basis {
@@ -58,29 +33,11 @@ impl Basis {
         Self { n_pairs: mdp.n_pairs(), n_functions: mdp.n_pairs(), kind: Kind::StateAction }
     }
 
-    /// A feature table of shape (`n_states * n_actions`, `n_basis`), row-major.
-    ///
-    /// # Errors
-    /// Another shape, or an entry that is not finite.
-    pub fn features(mdp: &TabularMdp, n_basis: usize, table: &[f64]) -> Result<Self, BasisError> {
-        let n_pairs = mdp.n_pairs();
-        if n_basis == 0 || n_pairs.checked_mul(n_basis) != Some(table.len()) {
-            return Err(BasisError::Shape { n_pairs, n_basis, got: table.len() });
-        }
-        let (mut offsets, mut columns, mut values) = (vec![0], Vec::new(), Vec::new());
-        for (row, features) in table.chunks_exact(n_basis).enumerate() {
-            for (column, &value) in features.iter().enumerate() {
-                if !value.is_finite() {
-                    return Err(BasisError::NotFinite { row, value });
-                }
-                if value != 0.0 {
-                    columns.push(column as u32);
-                    values.push(value);
-                }
-            }
-            offsets.push(columns.len());
-        }
-        Ok(Self { n_pairs, n_functions: n_basis, kind: Kind::Features { offsets, columns, values } })
+    /// A user's features, one function each.
+    #[must_use]
+    pub fn features(features: &Features) -> Self {
+        let n_functions = features.len();
+        Self { n_pairs: features.n_pairs(), n_functions, kind: Kind::Features(features.clone()) }
     }
 
     /// Number of basis functions B.
@@ -98,9 +55,10 @@ impl Basis {
         match &self.kind {
             Kind::State { n_actions } => visit(pair / n_actions, 1.0),
             Kind::StateAction => visit(pair, 1.0),
-            Kind::Features { offsets, columns, values } => {
-                for entry in offsets[pair]..offsets[pair + 1] {
-                    visit(columns[entry] as usize, values[entry]);
+            Kind::Features(features) => {
+                let (columns, values) = features.row(pair);
+                for (&column, &value) in columns.iter().zip(values) {
+                    visit(column as usize, value);
                 }
             }
         }
@@ -135,7 +93,9 @@ mod tests {
     fn rewards_and_projections_are_adjoint() {
         let mdp = TabularMdp::new(2, 2, vec![0, 1, 2, 3, 4], vec![0, 1, 1, 0], vec![1.0; 4], None).expect("a model");
         let table = [1.0, 0.0, -2.0, 0.0, 3.0, 0.5, 0.0, 0.0, 4.0, 1.0, 1.0, 1.0];
-        let all = [Basis::state(&mdp), Basis::state_action(&mdp), Basis::features(&mdp, 3, &table).expect("a basis")];
+        let names = ["x", "y", "z"].map(str::to_owned).to_vec();
+        let features = Features::of_pairs(4, names, &table).expect("features");
+        let all = [Basis::state(&mdp), Basis::state_action(&mdp), Basis::features(&features)];
         assert_eq!(all.each_ref().map(Basis::len), [2, 4, 3]);
         for basis in all {
             let weights: Vec<f64> = (0..basis.len()).map(|b| 1.0 + b as f64).collect();
@@ -144,11 +104,5 @@ mod tests {
             let right: f64 = basis.project(&values).iter().zip(&weights).map(|(p, w)| p * w).sum();
             assert!((left - right).abs() < 1e-12);
         }
-        assert!(matches!(Basis::features(&mdp, 3, &table[1..]), Err(BasisError::Shape { .. })));
-        assert!(matches!(Basis::features(&mdp, 0, &[]), Err(BasisError::Shape { .. })));
-        assert!(matches!(
-            Basis::features(&mdp, 1, &[0.0, 0.0, f64::NAN, 0.0]),
-            Err(BasisError::NotFinite { row: 2, .. })
-        ));
     }
 }

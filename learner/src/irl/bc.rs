@@ -49,6 +49,8 @@ impl Method for Bc {
             policy,
             state_values: vec![0.0; n_states],
             standard_errors: None,
+            posterior: None,
+            hyperparameters: Vec::new(),
             trace: trace.entries,
             stopped: Stopped::ClosedForm,
             iterations: 1,

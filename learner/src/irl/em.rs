@@ -6,9 +6,7 @@
 //!
 //! The objective is the part of Q that depends on the reward, cᵀw − ½ wᵀC w. C is diagonal for the Dirac bases offered here.
 
-use super::temperature::most_likely_boltzmann;
 use super::{Fit, FitError, MStep, Method, Problem, Progress, Responsibility, Stopped, Trace, nnls, simplex};
-use crate::mdp::plan;
 use nalgebra::{DMatrix, DVector};
 
 /// Demonstrated basis functions that the dense least-squares problem may hold (512 MB).
@@ -69,10 +67,6 @@ impl Method for Em {
             }
         }
 
-        let reward = basis.reward(&weights);
-        let planned = plan(options.planner, problem.mdp, &reward, &problem.plan_options())?;
-        let counts = problem.statistics.counts(options.horizon);
-        let (policy, _) = most_likely_boltzmann(problem.mdp.n_actions(), &planned.action_values, &counts);
         let mut warnings = Vec::new();
         if options.responsibility == Responsibility::Exact && kept < LOST {
             warnings.push(format!(
@@ -81,22 +75,7 @@ impl Method for Em {
                 problem.statistics.n_trajectories()
             ));
         }
-        if !planned.converged {
-            warnings.push("the planner stopped before it converged".to_owned());
-        }
-        let iterations = trace.entries.len() as u32;
-        Ok(Fit {
-            weights,
-            reward,
-            policy: policy.into_probabilities(),
-            greedy_policy: planned.greedy_policy().into_probabilities(),
-            state_values: planned.state_values,
-            standard_errors: None,
-            trace: trace.entries,
-            stopped,
-            iterations,
-            warnings,
-        })
+        Fit::planned(problem, &basis, weights, trace, stopped, warnings)
     }
 }
 

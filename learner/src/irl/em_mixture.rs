@@ -4,9 +4,8 @@
 //! finite mixture: concave, and EM multiplies w_b by the mean responsibility of b. The stopping rule watches a bound:
 //! by concavity, no w on the simplex is better than the present one by more than max_b g_b − L, g the gradient.
 
-use super::temperature::most_likely_boltzmann;
 use super::{Fit, FitError, Method, Problem, Progress, Stopped, Trace};
-use crate::mdp::{max_abs, plan};
+use crate::mdp::max_abs;
 use std::collections::BTreeMap;
 
 /// Mixing proportions by EM.
@@ -80,24 +79,6 @@ impl Method for EmMixture {
             }
         }
 
-        let reward = basis.reward(&weights);
-        let planned = plan(options.planner, problem.mdp, &reward, &problem.plan_options())?;
-        let counts = problem.statistics.counts(options.horizon);
-        let (policy, _) = most_likely_boltzmann(n_actions, &planned.action_values, &counts);
-        let warnings =
-            if planned.converged { Vec::new() } else { vec!["the planner stopped before it converged".to_owned()] };
-        let iterations = trace.entries.len() as u32;
-        Ok(Fit {
-            weights,
-            reward,
-            policy: policy.into_probabilities(),
-            greedy_policy: planned.greedy_policy().into_probabilities(),
-            state_values: planned.state_values,
-            standard_errors: None,
-            trace: trace.entries,
-            stopped,
-            iterations,
-            warnings,
-        })
+        Fit::planned(problem, &basis, weights, trace, stopped, Vec::new())
     }
 }

@@ -17,10 +17,11 @@ mod simplex;
 mod temperature;
 
 pub use crate::mdp::{HorizonPrior, PlannerKind};
-pub use basis::{Basis, BasisError};
-pub use options::{BasisKind, FitOptions, MStep, Penalty, Responsibility};
+pub use basis::Basis;
+pub use options::{BasisKind, FitOptions, MStep, Penalty, PosteriorKind, Responsibility, RewardPrior};
 
-use crate::mdp::{PlanError, PlanOptions, TabularMdp};
+use self::temperature::most_likely_boltzmann;
+use crate::mdp::{Features, PlanError, PlanOptions, TabularMdp, plan};
 use crate::statistics::Statistics;
 use crate::trajectory::Demonstrations;
 use serde::{Deserialize, Serialize};
@@ -38,6 +39,8 @@ pub struct Problem<'a> {
     pub statistics: &'a Statistics,
     /// The trajectories themselves, where [`Method::needs_demonstrations`] asks for them.
     pub demonstrations: Option<&'a Demonstrations>,
+    /// The user's features, where there are any.
+    pub features: Option<&'a Features>,
 }
 
 /// A way to learn a reward and a policy.
@@ -129,6 +132,18 @@ impl Problem<'_> {
                 got_actions: statistics.n_actions(),
             });
         }
+        match self.features {
+            None if self.options.basis == BasisKind::Features => {
+                let message = "expected a model with features for the basis features, got none".to_owned();
+                return Err(FitError::InvalidOption { field: "basis", message });
+            }
+            Some(features) if features.n_pairs() != mdp.n_pairs() => {
+                let message =
+                    format!("expected features of {} state-action pairs, got {}", mdp.n_pairs(), features.n_pairs());
+                return Err(FitError::InvalidOption { field: "basis", message });
+            }
+            _ => {}
+        }
         self.options.check()
     }
 
@@ -138,9 +153,11 @@ impl Problem<'_> {
     }
 
     fn basis(&self) -> Basis {
-        match self.options.basis {
-            BasisKind::State => Basis::state(self.mdp),
-            BasisKind::StateAction => Basis::state_action(self.mdp),
+        match (self.options.basis, self.features) {
+            (BasisKind::State, _) => Basis::state(self.mdp),
+            (BasisKind::StateAction, _) => Basis::state_action(self.mdp),
+            (BasisKind::Features, Some(features)) => Basis::features(features),
+            (BasisKind::Features, None) => unreachable!("checked before"),
         }
     }
 
@@ -215,6 +232,10 @@ pub struct Fit {
     pub state_values: Vec<f64>,
     /// Standard errors of the weights from the exact Hessian (unpenalised likelihood only), shape (`n_basis`,).
     pub standard_errors: Option<Vec<f64>>,
+    /// What the data leave open, where the method has a posterior.
+    pub posterior: Option<Posterior>,
+    /// What the method learned beside the reward, such as the strength of its prior.
+    pub hyperparameters: Vec<Hyperparameter>,
     /// One entry an iteration.
     pub trace: Vec<TraceEntry>,
     /// How it stopped.
@@ -223,6 +244,87 @@ pub struct Fit {
     pub iterations: u32,
     /// What a careful reader should know.
     pub warnings: Vec<String>,
+}
+
+/// The posterior of the weights, function by function.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Posterior {
+    /// Standard deviations, shape (`n_basis`,).
+    pub standard_deviations: Vec<f64>,
+    /// Lower ends of the central 95% intervals, shape (`n_basis`,).
+    pub low: Vec<f64>,
+    /// Upper ends, shape (`n_basis`,).
+    pub high: Vec<f64>,
+    /// How well the chains explored it, where it was sampled.
+    pub diagnostics: Option<Diagnostics>,
+}
+
+/// How well Markov chains explored a posterior, after Vehtari, Gelman, Simpson, Carpenter & Bürkner (2021).
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Diagnostics {
+    /// Number of chains.
+    pub chains: u32,
+    /// Draws kept of each.
+    pub draws: u32,
+    /// Share of proposals that were accepted.
+    pub acceptance: f64,
+    /// Split-R̂ of each weight, near 1 where the chains agree, shape (`n_basis`,).
+    pub split_rhat: Vec<f64>,
+    /// Draws that independent ones would need to tell as much, of each weight, shape (`n_basis`,).
+    pub effective_sample_size: Vec<f64>,
+}
+
+/// A number that a method learned beside the reward.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Hyperparameter {
+    /// Its name, as in "penalty_strength".
+    pub name: String,
+    /// Its value.
+    pub value: f64,
+}
+
+impl Fit {
+    /// The fit of a reward that a planner turns into a policy: its greedy policy is the plan's, its stochastic one the
+    /// Boltzmann policy of the plan's action values that explains the demonstrations best.
+    fn planned(
+        problem: &Problem<'_>,
+        basis: &Basis,
+        weights: Vec<f64>,
+        trace: Trace<'_>,
+        stopped: Stopped,
+        mut warnings: Vec<String>,
+    ) -> Result<Self, FitError> {
+        let reward = basis.reward(&weights);
+        let planned = plan(problem.options.planner, problem.mdp, &reward, &problem.plan_options())?;
+        let counts = problem.statistics.counts(problem.options.horizon);
+        let (policy, _) = most_likely_boltzmann(problem.mdp.n_actions(), &planned.action_values, &counts);
+        if !planned.converged {
+            warnings.push("the planner stopped before it converged".to_owned());
+        }
+        let iterations = trace.entries.len() as u32;
+        Ok(Self {
+            weights,
+            reward,
+            policy: policy.into_probabilities(),
+            greedy_policy: planned.greedy_policy().into_probabilities(),
+            state_values: planned.state_values,
+            standard_errors: None,
+            posterior: None,
+            hyperparameters: Vec::new(),
+            trace: trace.entries,
+            stopped,
+            iterations,
+            warnings,
+        })
+    }
+}
+
+/// Fits with a method; the one entry for every caller.
+///
+/// # Errors
+/// As [`Method::fit`].
+pub fn fit(method: &dyn Method, problem: &Problem<'_>, progress: Progress<'_>) -> Result<Fit, FitError> {
+    method.fit(problem, progress)
 }
 
 /// Called after every iteration; `Break` cancels the fit.

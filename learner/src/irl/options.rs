@@ -13,6 +13,8 @@ pub enum BasisKind {
     State,
     /// Dirac on state-action pairs, shape (`n_states * n_actions`,).
     StateAction,
+    /// The features of [`Problem::features`](super::Problem::features).
+    Features,
 }
 
 /// Reward step of `em`.
@@ -50,6 +52,32 @@ pub enum Penalty {
     None,
 }
 
+/// What `em-tied` acts on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum PosteriorKind {
+    /// The optimum alone: a point estimate.
+    None,
+    /// The posterior mean, from a Gaussian around the optimum.
+    Laplace,
+    /// The posterior mean, from Hamiltonian Monte Carlo.
+    #[default]
+    Hmc,
+}
+
+/// Prior of `birl` over the reward of each basis function, Ramachandran & Amir (2007) §3.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum RewardPrior {
+    /// Uniform on [0, 1].
+    #[default]
+    Uniform,
+    /// Exponential on [0, 1]: most rewards are small.
+    Exponential,
+    /// Beta(½, ½): rewards are near 0 or near 1.
+    Beta,
+}
+
 /// Everything that decides a fit beside model and data.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
@@ -72,8 +100,20 @@ pub struct FitOptions {
     pub reference_basis: u32,
     /// Penalty of `em-tied`.
     pub penalty: Penalty,
-    /// Strength of the penalty.
-    pub penalty_strength: f64,
+    /// Strength of the penalty; `None`: the method's own, or learned from the data where the method can.
+    pub penalty_strength: Option<f64>,
+    /// What `em-tied` acts on.
+    pub posterior: PosteriorKind,
+    /// Prior of `birl`.
+    pub reward_prior: RewardPrior,
+    /// β of `birl`: how sharply the expert prefers better actions.
+    pub rationality: f64,
+    /// Chains of methods that sample.
+    pub chains: u32,
+    /// Draws that each chain keeps; `None`: the method's own number.
+    pub draws: Option<u32>,
+    /// Draws that each chain makes first and forgets; `None`: the method's own number.
+    pub warm_up: Option<u32>,
     /// Change of the objective below which a fit has converged.
     pub tolerance: f64,
     /// Iterations after which a fit stops all the same.
@@ -96,7 +136,13 @@ impl Default for FitOptions {
             planner: PlannerKind::default(),
             reference_basis: 0,
             penalty: Penalty::default(),
-            penalty_strength: 1.0,
+            penalty_strength: None,
+            posterior: PosteriorKind::default(),
+            reward_prior: RewardPrior::default(),
+            rationality: 10.0,
+            chains: 4,
+            draws: None,
+            warm_up: None,
             tolerance: 1e-6,
             max_iterations: 1000,
             smoothing: 0.0,
@@ -118,9 +164,19 @@ impl FitOptions {
         if self.max_iterations == 0 {
             return invalid("max_iterations", "expected at least 1 iteration, got 0".to_owned());
         }
-        for (field, value) in
-            [("penalty_strength", self.penalty_strength), ("tolerance", self.tolerance), ("smoothing", self.smoothing)]
-        {
+        if self.chains == 0 {
+            return invalid("chains", "expected at least 1 chain, got 0".to_owned());
+        }
+        if self.draws == Some(0) {
+            return invalid("draws", "expected at least 1 draw a chain, got 0".to_owned());
+        }
+        let not_negative = [
+            ("penalty_strength", self.penalty_strength.unwrap_or(0.0)),
+            ("rationality", self.rationality),
+            ("tolerance", self.tolerance),
+            ("smoothing", self.smoothing),
+        ];
+        for (field, value) in not_negative {
             if !(value.is_finite() && value >= 0.0) {
                 return invalid(field, format!("expected a finite number that is not negative, got {value}"));
             }

@@ -7,6 +7,7 @@
 #![expect(clippy::doc_markdown, reason = "formulae in the notation of the papers are not code")]
 
 mod evaluation;
+mod features;
 mod linear;
 mod numeric;
 mod occupancy;
@@ -16,6 +17,7 @@ mod policy;
 mod tabular;
 
 pub use evaluation::evaluate_policy;
+pub use features::{Features, FeaturesError};
 pub use occupancy::{
     discounted_occupancy, finite_horizon_occupancy, state_action_occupancy, state_occupancies_by_step,
 };

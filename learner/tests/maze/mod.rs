@@ -1,7 +1,7 @@
 //! The reference maze: model and demonstrations computed independently, under `tests/data`.
 #![allow(dead_code, reason = "every test file uses its own part")]
 
-use mazeway_learner::mdp::TabularMdp;
+use mazeway_learner::mdp::{PlanOptions, PlannerKind, TabularMdp, plan};
 use mazeway_learner::statistics::Statistics;
 use mazeway_learner::trajectory::{Demonstrations, Trajectory};
 use rand_core::Rng;
@@ -37,7 +37,7 @@ pub struct Maze {
 impl Maze {
     /// 1 / (number of optimal actions) on each optimal action.
     pub fn optimal_policy(&self) -> Vec<f64> {
-        let mut policy = vec![0.0; N_STATES * N_ACTIONS];
+        let mut policy = vec![0.0; self.mdp.n_pairs()];
         for (state, actions) in self.optimal_actions.iter().enumerate() {
             for &action in actions {
                 policy[state * N_ACTIONS + action as usize] = 1.0 / actions.len() as f64;
@@ -75,6 +75,39 @@ pub fn maze() -> Maze {
     }
 }
 
+/// Layouts under `tests/data/layouts` and their slips, for tests over several mazes: the paper's, one given with independent
+/// figures, and random ones of several sizes.
+pub const LAYOUTS: [(&str, f64); 7] =
+    [("maze-v0", 0.3), ("given", 0.3), ("small", 0.3), ("wide", 0.1), ("tree", 0.3), ("open", 0.5), ("large", 0.2)];
+
+/// The model of a layout, as the simulator makes it, and its optimal policy at [`DISCOUNT`].
+pub fn layout(name: &str, slip: f64) -> Maze {
+    let path =
+        std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/data/layouts").join(name).with_extension("txt");
+    let text = std::fs::read_to_string(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
+    let options = [("layout".to_owned(), Value::from(text)), ("slip".to_owned(), Value::from(slip))];
+    let configured = mazeway_server::sim::maze::configure(&options.into_iter().collect())
+        .expect("a layout that the simulator takes");
+    let model = configured.model();
+    let (n_states, n_actions) = (model.n_states as usize, model.n_actions as usize);
+    let mdp = TabularMdp::new(
+        n_states,
+        n_actions,
+        model.row_offsets,
+        model.next_states,
+        model.probabilities,
+        Some(model.initial_distribution),
+    )
+    .expect("a checked model");
+    let reward = model.rewards.into_iter().next().expect("a reward").1;
+    let options = PlanOptions { discount: DISCOUNT, ..PlanOptions::default() };
+    let optimal = plan(PlannerKind::PolicyIteration, &mdp, &reward, &options).expect("a plan");
+    let greedy = optimal.greedy_policy();
+    let best = |state: &[f64]| (0..n_actions as u32).filter(|&a| state[a as usize] > 0.0).collect();
+    let optimal_actions = greedy.probabilities().chunks_exact(n_actions).map(best).collect();
+    Maze { mdp, reward, state_values: optimal.state_values, optimal_actions }
+}
+
 pub fn demonstrations() -> Demonstrations {
     let data = read("maze_demonstrations.json");
     let states = data["states"].as_array().expect("rows");
@@ -89,7 +122,11 @@ pub fn demonstrations() -> Demonstrations {
 }
 
 pub fn statistics(demonstrations: &Demonstrations) -> Statistics {
-    let mut builder = Statistics::builder(N_STATES, N_ACTIONS, None);
+    statistics_in(N_STATES, demonstrations)
+}
+
+pub fn statistics_in(n_states: usize, demonstrations: &Demonstrations) -> Statistics {
+    let mut builder = Statistics::builder(n_states, N_ACTIONS, None);
     builder.extend(demonstrations).expect("within the maze");
     builder.finish().expect("at least one trajectory")
 }
@@ -101,7 +138,7 @@ pub fn cases() -> Vec<Value> {
 /// Share of states whose greedy action is optimal, ties split evenly.
 pub fn agreement(greedy: &[f64], optimal: &[f64]) -> f64 {
     let agreed: f64 = greedy.iter().zip(optimal).filter(|&(_, o)| *o > 0.0).map(|(g, _)| g).sum();
-    agreed / N_STATES as f64
+    agreed * N_ACTIONS as f64 / optimal.len() as f64
 }
 
 /// Episodes of the optimal policy, ties split evenly, from uniform starts; the same for a seed on every platform.
@@ -119,8 +156,8 @@ pub fn simulate(maze: &Maze, episodes: usize, steps: usize, seed: u64) -> Demons
                 let (next, probabilities) = maze.mdp.row(maze.mdp.pair(state, action));
                 state = next[draw(probabilities, &mut random)] as usize;
             }
-            Trajectory::new(states, actions, Some(state as u32), N_STATES as u32, N_ACTIONS as u32)
-                .expect("a trajectory")
+            let n_states = maze.mdp.n_states() as u32;
+            Trajectory::new(states, actions, Some(state as u32), n_states, N_ACTIONS as u32).expect("a trajectory")
         })
         .collect()
 }

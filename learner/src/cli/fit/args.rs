@@ -123,9 +123,9 @@ pub struct FitArgs {
     /// Penalty on the weights of em-tied
     #[arg(long, value_enum, default_value = "l1", value_name = "PENALTY", help_heading = "Learning")]
     pub penalty: PenaltyArg,
-    /// Strength of the penalty
-    #[arg(long, default_value_t = 1.0, value_name = "STRENGTH", help_heading = "Learning")]
-    pub penalty_strength: f64,
+    /// Strength of the penalty [default: the method's own]
+    #[arg(long, value_name = "STRENGTH", help_heading = "Learning")]
+    pub penalty_strength: Option<f64>,
     /// Pseudo-count of bc on every action
     #[arg(long, default_value_t = 0.0, value_name = "COUNT", help_heading = "Learning")]
     pub smoothing: f64,

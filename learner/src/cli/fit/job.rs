@@ -83,7 +83,7 @@ impl Job {
             ));
         }
         for (flag, value) in [
-            ("--penalty-strength", args.penalty_strength),
+            ("--penalty-strength", args.penalty_strength.unwrap_or(0.0)),
             ("--smoothing", args.smoothing),
             ("--tolerance", args.tolerance),
         ] {
@@ -165,7 +165,7 @@ fn fit_options(args: &FitArgs) -> FitOptions {
             PenaltyArg::None => pb::Penalty::None,
         }
         .into(),
-        penalty_strength: Some(args.penalty_strength),
+        penalty_strength: args.penalty_strength,
         tolerance: Some(args.tolerance),
         max_iterations: Some(args.max_iterations),
         smoothing: Some(args.smoothing),

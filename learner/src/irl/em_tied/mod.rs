@@ -49,7 +49,7 @@ pub fn fit_with_basis(problem: &Problem<'_>, basis: &Basis, progress: Progress<'
     let mut trace = Trace::new(progress);
     let counts = problem.statistics.counts(options.horizon);
     let mut likelihood = Likelihood::new(problem.mdp, basis, counts, options.discount);
-    let strength = options.penalty_strength;
+    let strength = options.penalty_strength.unwrap_or(1.0);
     let settings = Settings {
         lower: if options.penalty == Penalty::L1 { 0.0 } else { f64::NEG_INFINITY },
         tolerance: options.tolerance,
@@ -118,6 +118,8 @@ pub fn fit_with_basis(problem: &Problem<'_>, basis: &Basis, progress: Progress<'
         greedy_policy: Policy::greedy(n_actions, soft.action_values()).into_probabilities(),
         state_values: soft.state_values().to_vec(),
         standard_errors: errors,
+        posterior: None,
+        hyperparameters: Vec::new(),
         weights,
         trace: trace.entries,
         stopped: minimum.stopped,

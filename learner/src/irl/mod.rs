@@ -8,11 +8,15 @@
 mod basis;
 mod bc;
 mod bounded;
+#[allow(dead_code, reason = "the methods that sample come to it one by one")]
+mod diagnostics;
 mod em;
 mod em_mixture;
 pub mod em_tied;
 pub mod nnls;
 mod options;
+#[allow(dead_code, reason = "the methods that sample come to it one by one")]
+mod random;
 mod simplex;
 mod temperature;
 

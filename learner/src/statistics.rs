@@ -5,9 +5,11 @@
 //! Deliberately absent: whole trajectories; the one method that needs them takes
 //! [`Demonstrations`](crate::trajectory::Demonstrations).
 
+mod counts;
+
 use crate::mdp::TabularMdp;
 use crate::trajectory::Trajectory;
-use std::collections::BTreeMap;
+use counts::Counts;
 
 /// Gathers [`Statistics`].
 #[derive(Debug, Clone)]
@@ -15,7 +17,7 @@ pub struct StatisticsBuilder {
     n_states: usize,
     n_actions: usize,
     horizon: usize,
-    steps: Vec<BTreeMap<u32, u64>>,
+    steps: Vec<Counts>,
     n_trajectories: u64,
 }
 
@@ -56,20 +58,47 @@ impl StatisticsBuilder {
     /// # Errors
     /// An index outside the process; nothing of the trajectory is counted then.
     pub fn add(&mut self, trajectory: &Trajectory) -> Result<(), StatisticsError> {
+        self.add_steps(trajectory.states(), trajectory.actions(), |&index| index)
+    }
+
+    /// Counts a trajectory as it is stored: states and actions packed as little-endian 32-bit integers, without unpacking
+    /// them first. Of arrays that differ in length, what goes beyond the shorter one does not count; without a step there is
+    /// no trajectory.
+    ///
+    /// # Errors
+    /// As [`StatisticsBuilder::add`].
+    pub fn add_packed(&mut self, states: &[u8], actions: &[u8]) -> Result<(), StatisticsError> {
+        self.add_steps(states.as_chunks().0, actions.as_chunks().0, |&bytes| u32::from_le_bytes(bytes))
+    }
+
+    fn add_steps<T>(
+        &mut self,
+        states: &[T],
+        actions: &[T],
+        index: impl Fn(&T) -> u32 + Copy,
+    ) -> Result<(), StatisticsError> {
+        let n = states.len().min(actions.len()).min(self.horizon);
+        if n == 0 {
+            return Ok(());
+        }
+        let (states, actions) = (&states[..n], &actions[..n]);
         let (n_states, n_actions) = (self.n_states, self.n_actions);
-        let steps = || trajectory.states().iter().zip(trajectory.actions()).take(self.horizon).enumerate();
-        for (step, (&state, &action)) in steps() {
-            if state as usize >= n_states || action as usize >= n_actions {
-                return Err(StatisticsError::OutOfRange { n_states, n_actions, state, action, step });
+        // two plain maxima first: nothing may be counted of a trajectory that is refused
+        let largest = |values: &[T]| values.iter().map(index).fold(0, u32::max) as usize;
+        if largest(states) >= n_states || largest(actions) >= n_actions {
+            for (step, (state, action)) in states.iter().map(index).zip(actions.iter().map(index)).enumerate() {
+                if state as usize >= n_states || action as usize >= n_actions {
+                    return Err(StatisticsError::OutOfRange { n_states, n_actions, state, action, step });
+                }
             }
         }
-        if self.steps.len() < trajectory.len().min(self.horizon) {
-            self.steps.resize_with(trajectory.len().min(self.horizon), BTreeMap::new);
+        if self.steps.len() < n {
+            self.steps.resize_with(n, Counts::default);
         }
-        for (counts, (&state, &action)) in
-            self.steps.iter_mut().zip(trajectory.states().iter().zip(trajectory.actions()))
-        {
-            *counts.entry(state * n_actions as u32 + action).or_insert(0) += 1;
+        let n_pairs = n_states.saturating_mul(n_actions);
+        for (counts, (state, action)) in self.steps.iter_mut().zip(states.iter().zip(actions)) {
+            // no model has more pairs than 32 bits count, so whatever wraps is refused with its model
+            counts.add(index(state).wrapping_mul(n_actions as u32).wrapping_add(index(action)), n_pairs);
         }
         self.n_trajectories += 1;
         Ok(())
@@ -94,11 +123,7 @@ impl StatisticsBuilder {
         if self.n_trajectories == 0 {
             return Err(StatisticsError::Empty);
         }
-        let steps: Vec<Vec<(u32, f64)>> = self
-            .steps
-            .into_iter()
-            .map(|counts| counts.into_iter().map(|(pair, count)| (pair, count as f64)).collect())
-            .collect();
+        let steps = self.steps.into_iter().map(Counts::into_sorted).collect();
         Ok(Statistics {
             n_states: self.n_states,
             n_actions: self.n_actions,
@@ -192,6 +217,8 @@ pub fn expected_arrivals(mdp: &TabularMdp, counts: &[f64]) -> Vec<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use proptest::prelude::*;
+    use std::collections::BTreeMap;
 
     fn trajectory(states: &[u32], actions: &[u32]) -> Trajectory {
         Trajectory::new(states.to_vec(), actions.to_vec(), None, 9, 9).expect("a trajectory")
@@ -216,13 +243,54 @@ mod tests {
         assert_eq!((statistics.states_covered(None), statistics.states_covered(Some(1))), (3, 1));
     }
 
+    proptest! {
+        #[test]
+        fn equals_a_naive_count(
+            n_states in 1_u32..60,
+            n_actions in 1_u32..6,
+            horizon in proptest::option::of(1_u32..12),
+            draws in proptest::collection::vec(proptest::collection::vec((any::<u32>(), any::<u32>()), 1..16), 1..200),
+        ) {
+            let mut builder = Statistics::builder(n_states as usize, n_actions as usize, horizon);
+            let mut packed = builder.clone();
+            let mut naive = vec![BTreeMap::<u32, f64>::new(); 16];
+            for draw in &draws {
+                // squares crowd the small states: steps with many repetitions beside steps with few
+                let states: Vec<u32> = draw.iter().map(|d| (d.0 % n_states) * (d.0 % n_states) / n_states).collect();
+                let actions: Vec<u32> = draw.iter().map(|d| d.1 % n_actions).collect();
+                for (k, (s, a)) in states.iter().zip(&actions).take(horizon.unwrap_or(99) as usize).enumerate() {
+                    *naive[k].entry(s * n_actions + a).or_default() += 1.0;
+                }
+                let bytes = |values: &[u32]| values.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>();
+                packed.add_packed(&bytes(&states), &bytes(&actions)).expect("counted");
+                builder.add(&Trajectory::new(states, actions, None, n_states, n_actions).expect("a trajectory"))
+                    .expect("counted");
+            }
+            let statistics = builder.finish().expect("counts");
+            prop_assert_eq!(&statistics, &packed.finish().expect("counts"));
+            for (k, naive) in naive.iter().enumerate() {
+                let naive: Vec<(u32, f64)> = naive.iter().map(|(&pair, &n)| (pair, n)).collect();
+                prop_assert_eq!(statistics.step_counts(k), naive.as_slice());
+            }
+        }
+    }
+
     #[test]
     fn memory_does_not_grow_with_the_data() {
-        let mut builder = Statistics::builder(3, 2, None);
+        let mut builder = Statistics::builder(3000, 2, None);
+        let one = trajectory(&[0, 1, 2], &[0, 1, 0]);
+        builder.add(&one).expect("counted");
+        let before: usize = builder.steps.iter().map(Counts::bytes).sum();
         for _ in 0..1000 {
-            builder.add(&trajectory(&[0, 1, 2], &[0, 1, 0])).expect("counted");
+            builder.add(&one).expect("counted");
         }
-        assert_eq!(builder.steps.iter().map(BTreeMap::len).sum::<usize>(), 3);
+        assert_eq!(builder.steps.iter().map(Counts::bytes).sum::<usize>(), before);
+        // a long trajectory that never comes back does not take the whole model a step
+        let states: Vec<u32> = (0..3000).collect();
+        builder
+            .add_packed(&states.iter().flat_map(|s| s.to_le_bytes()).collect::<Vec<u8>>(), &[0; 12000])
+            .expect("counted");
+        assert!(builder.steps.iter().map(Counts::bytes).sum::<usize>() < 3000 * 200);
     }
 
     #[test]
@@ -232,6 +300,9 @@ mod tests {
         let before = builder.clone().finish();
         assert!(matches!(builder.add(&trajectory(&[0, 3], &[0, 0])), Err(StatisticsError::OutOfRange { step: 1, .. })));
         assert!(matches!(builder.add(&trajectory(&[0, 2], &[0, 2])), Err(StatisticsError::OutOfRange { step: 1, .. })));
+        let packed = |values: [u32; 2]| values.map(u32::to_le_bytes).concat();
+        let refused = builder.add_packed(&packed([0, 3]), &packed([0, 0]));
+        assert!(matches!(refused, Err(StatisticsError::OutOfRange { step: 1, state: 3, .. })));
         assert_eq!(builder.finish(), before);
         assert_eq!(Statistics::builder(3, 2, None).finish(), Err(StatisticsError::Empty));
     }

@@ -7,15 +7,14 @@
 
 mod basis;
 mod bc;
+mod birl;
 mod bounded;
-#[allow(dead_code, reason = "the methods that sample come to it one by one")]
 mod diagnostics;
 mod em;
 mod em_mixture;
 pub mod em_tied;
 pub mod nnls;
 mod options;
-#[allow(dead_code, reason = "the methods that sample come to it one by one")]
 mod random;
 mod simplex;
 mod temperature;
@@ -68,7 +67,7 @@ pub trait Method: Sync {
 }
 
 /// All methods, the default first.
-pub const METHODS: &[&dyn Method] = &[&em_tied::EmTied, &em::Em, &em_mixture::EmMixture, &bc::Bc];
+pub const METHODS: &[&dyn Method] = &[&em_tied::EmTied, &em::Em, &em_mixture::EmMixture, &birl::Birl, &bc::Bc];
 
 /// The method of a name.
 pub fn method(id: &str) -> Option<&'static dyn Method> {

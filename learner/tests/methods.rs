@@ -5,7 +5,7 @@ mod random;
 use mazeway_learner::irl::em_tied::{Likelihood, fit_with_basis};
 use mazeway_learner::irl::{
     self, Basis, BasisKind, Fit, FitError, FitOptions, HorizonPrior, METHODS, MStep, Penalty, PlannerKind, Problem,
-    Responsibility, Stopped,
+    Responsibility, RewardPrior, Stopped,
 };
 use mazeway_learner::mdp::{Features, TabularMdp};
 use mazeway_learner::statistics::Statistics;
@@ -50,6 +50,11 @@ fn random_options(random: &mut rand_pcg::Pcg64) -> FitOptions {
         penalty_strength: Some(pick(&[0.0, 0.01, 1.0, 100.0], random)),
         smoothing: pick(&[0.0, 1.0], random),
         max_iterations: 200,
+        reward_prior: pick(&[RewardPrior::Uniform, RewardPrior::Exponential, RewardPrior::Beta], random),
+        rationality: pick(&[0.0, 1.0, 10.0, 1e4], random),
+        chains: 2,
+        draws: Some(pick(&[1, 10], random)),
+        warm_up: Some(pick(&[0, 10], random)),
         ..FitOptions::default()
     }
 }

@@ -11,7 +11,7 @@ use crate::irl::random::Stream;
 use nalgebra::{Cholesky, DMatrix};
 
 /// Wanted acceptance.
-const TARGET_ACCEPTANCE: f64 = 0.8;
+const TARGET_ACCEPTANCE: f64 = 0.7;
 /// Mean length of a trajectory in units of the metric: a quarter of the period of a Gaussian of unit metric.
 const LENGTH: f64 = std::f64::consts::FRAC_PI_2;
 /// Steps of one trajectory at most.
@@ -131,11 +131,11 @@ impl<'a> Chain<'a> {
                 self.start_metric();
             }
         } else {
-            if (i - collect_from).is_multiple_of(every) && i <= 3 * w / 4 {
+            if (i - collect_from).is_multiple_of(every) && i <= 5 * w / 8 {
                 self.refresh_point();
-                self.metric.collect(&self.target, &self.x);
+                self.metric.collect(&self.target, &self.x, &self.point.gradient);
             }
-            if i == collect_from || i == w / 2 || i == 3 * w / 4 {
+            if i == collect_from || i == w / 2 || i == 5 * w / 8 {
                 self.metric.renew();
                 self.step.restart();
             }
@@ -146,7 +146,7 @@ impl<'a> Chain<'a> {
         if self.is_finite() {
             self.refresh_point();
             self.metric = Metric::unit(self.x.len());
-            self.metric.collect(&self.target, &self.x);
+            self.metric.collect(&self.target, &self.x, &self.point.gradient);
             self.metric.renew();
             self.metric.forget();
             self.step.restart();
@@ -162,6 +162,8 @@ impl<'a> Chain<'a> {
 /// M of the kinetic energy ½ pᵀM⁻¹p.
 struct Metric {
     collected: u32,
+    /// Sum of x dℓ/dx: the part of the Hessian of −ℓ that the change of scale makes, on the diagonal.
+    curvature: Vec<f64>,
     kind: Kind,
 }
 
@@ -180,10 +182,14 @@ impl Metric {
         } else {
             Kind::Diagonal { sum: vec![0.0; n], metric: vec![1.0; n] }
         };
-        Self { collected: 0, kind }
+        Self { collected: 0, curvature: vec![0.0; n], kind }
     }
 
-    fn collect(&mut self, target: &Target<'_>, x: &[f64]) {
+    /// `gradient` is that of the log-density at `x`, the point last evaluated.
+    fn collect(&mut self, target: &Target<'_>, x: &[f64], gradient: &[f64]) {
+        for ((c, x), g) in self.curvature.iter_mut().zip(x).zip(gradient) {
+            *c += x * (g + x);
+        }
         match &mut self.kind {
             Kind::Dense { sum, .. } => *sum += target.information(x),
             Kind::Diagonal { sum, .. } => axpy(1.0, &target.information_diagonal(x), sum),
@@ -193,6 +199,7 @@ impl Metric {
 
     fn forget(&mut self) {
         self.collected = 0;
+        self.curvature.fill(0.0);
         match &mut self.kind {
             Kind::Dense { sum, .. } => sum.fill(0.0),
             Kind::Diagonal { sum, .. } => sum.fill(0.0),
@@ -209,7 +216,7 @@ impl Metric {
             Kind::Dense { sum, inverse, factor } => {
                 let mut metric = &*sum * share;
                 for i in 0..metric.nrows() {
-                    metric[(i, i)] += 1.0;
+                    metric[(i, i)] += 1.0 + (share * self.curvature[i]).max(0.0);
                 }
                 if let Some(cholesky) = Cholesky::new(metric) {
                     *inverse = cholesky.inverse();
@@ -217,8 +224,8 @@ impl Metric {
                 }
             }
             Kind::Diagonal { sum, metric } => {
-                for (m, s) in metric.iter_mut().zip(sum) {
-                    *m = 1.0 + share * *s;
+                for ((m, s), c) in metric.iter_mut().zip(sum).zip(&self.curvature) {
+                    *m = 1.0 + share * (*s + c.max(0.0));
                 }
             }
         }

@@ -105,7 +105,7 @@ pub struct HeldOut {
     pub steps: u64,
 }
 
-/// Scores held-out trajectories; `None` for no trajectory.
+/// Scores held-out trajectories, those without actions left out; `None` for no trajectory.
 ///
 /// # Panics
 /// Where a trajectory's states or actions lie outside the policy.
@@ -116,7 +116,7 @@ pub fn held_out<'a>(
 ) -> Option<HeldOut> {
     let mut episodes = Vec::new();
     let (mut impossible_steps, mut steps) = (0, 0);
-    for trajectory in trajectories {
+    for trajectory in trajectories.into_iter().filter(|trajectory| trajectory.has_actions()) {
         let mut total = 0.0;
         for (&state, &action) in trajectory.states().iter().zip(trajectory.actions()) {
             let p = policy[state as usize * n_actions + action as usize];

@@ -1,7 +1,7 @@
 //! Mazeway's learner: watches experts act and works out what they want.
 //!
 //! Learning flows one way: trajectory → store → statistics → fit → policy → report. The core ([`mdp`], [`trajectory`],
-//! [`statistics`], [`irl`], [`eval`]) knows no storage and no transport and compiles without the feature `service`.
+//! [`transitions`], [`statistics`], [`irl`], [`eval`]) knows no storage and no transport and compiles without the feature `service`.
 
 #[cfg(feature = "service")]
 pub mod config;
@@ -16,6 +16,7 @@ pub mod statistics;
 #[cfg(feature = "service")]
 pub mod store;
 pub mod trajectory;
+pub mod transitions;
 
 #[cfg(feature = "service")]
 pub use config::Config;

@@ -9,7 +9,9 @@ mod counts;
 
 use crate::mdp::TabularMdp;
 use crate::trajectory::Trajectory;
+use crate::transitions::{TransitionCounts, TransitionCountsBuilder};
 use counts::Counts;
+use std::collections::BTreeMap;
 
 /// Gathers [`Statistics`].
 #[derive(Debug, Clone)]
@@ -18,6 +20,7 @@ pub struct StatisticsBuilder {
     n_actions: usize,
     horizon: usize,
     steps: Vec<Counts>,
+    latent: TransitionCountsBuilder,
     n_trajectories: u64,
 }
 
@@ -40,6 +43,16 @@ pub enum StatisticsError {
         /// Position in the trajectory.
         step: usize,
     },
+    /// The states of a trajectory without actions belong to another process.
+    #[error("expected states below {n_states}, got {state} at step {step}")]
+    StateOutOfRange {
+        /// Number of states.
+        n_states: usize,
+        /// What came.
+        state: u32,
+        /// Position in the trajectory.
+        step: usize,
+    },
     /// No trajectory was added.
     #[error("expected at least one trajectory, got none")]
     Empty,
@@ -50,7 +63,14 @@ impl StatisticsBuilder {
     #[must_use]
     pub fn new(n_states: usize, n_actions: usize, horizon: Option<u32>) -> Self {
         let horizon = horizon.map_or(usize::MAX, |k| k.max(1) as usize);
-        Self { n_states, n_actions, horizon, steps: Vec::new(), n_trajectories: 0 }
+        Self {
+            n_states,
+            n_actions,
+            horizon,
+            steps: Vec::new(),
+            latent: TransitionCountsBuilder::default(),
+            n_trajectories: 0,
+        }
     }
 
     /// Counts a trajectory.
@@ -58,7 +78,23 @@ impl StatisticsBuilder {
     /// # Errors
     /// An index outside the process; nothing of the trajectory is counted then.
     pub fn add(&mut self, trajectory: &Trajectory) -> Result<(), StatisticsError> {
+        if !trajectory.has_actions() {
+            return self.add_states(trajectory);
+        }
         self.add_steps(trajectory.states(), trajectory.actions(), |&index| index)
+    }
+
+    /// Counts the transitions of a trajectory whose actions were not seen.
+    fn add_states(&mut self, trajectory: &Trajectory) -> Result<(), StatisticsError> {
+        let n_states = self.n_states;
+        let seen = trajectory.len().min(self.horizon);
+        let states = trajectory.states().iter().copied().chain(trajectory.final_state()).take(seen + 1);
+        if let Some((step, state)) = states.enumerate().find(|&(_, state)| state as usize >= n_states) {
+            return Err(StatisticsError::StateOutOfRange { n_states, state, step });
+        }
+        self.latent.add(trajectory.states().iter().copied().zip(trajectory.next_states()).take(seen));
+        self.n_trajectories += 1;
+        Ok(())
     }
 
     /// Counts a trajectory as it is stored: states and actions packed as little-endian 32-bit integers, without unpacking
@@ -129,11 +165,13 @@ impl StatisticsBuilder {
             n_actions: self.n_actions,
             n_trajectories: self.n_trajectories,
             steps,
+            latent: self.latent.finish(),
         })
     }
 }
 
-/// Counts of demonstrated state-action pairs, per step. Invariant: at least one trajectory, hence at least one step.
+/// Counts of demonstrated state-action pairs, per step, and of transitions whose actions were not seen apart from them.
+/// Invariant: at least one trajectory, hence at least one step.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Statistics {
     n_states: usize,
@@ -141,6 +179,7 @@ pub struct Statistics {
     n_trajectories: u64,
     /// Per step: rising pairs and their counts.
     steps: Vec<Vec<(u32, f64)>>,
+    latent: TransitionCounts,
 }
 
 impl Statistics {
@@ -167,10 +206,35 @@ impl Statistics {
 
     /// Length of the longest trajectory, cut at the builder's horizon; at least 1.
     pub fn longest(&self) -> u32 {
-        self.steps.len() as u32
+        self.steps.len().max(self.latent.n_steps()) as u32
     }
 
-    /// `N_k(s,a)` of step `k` = 0, 1, …: rising pairs and how often they were seen there; empty beyond the longest trajectory.
+    /// Transitions whose actions were not seen; no other method here but those that say so counts them.
+    pub fn latent(&self) -> &TransitionCounts {
+        &self.latent
+    }
+
+    /// The same trajectories with pairs in place of what was not seen: `inferred` holds for each step pairs and their expected
+    /// counts, in any order.
+    pub(crate) fn completed(&self, inferred: Vec<Vec<(u32, f64)>>) -> Self {
+        let mut steps: Vec<BTreeMap<u32, f64>> = vec![BTreeMap::new(); self.steps.len().max(inferred.len())];
+        for (sums, counts) in steps.iter_mut().zip(&self.steps) {
+            sums.extend(counts.iter().copied());
+        }
+        for (sums, counts) in steps.iter_mut().zip(inferred) {
+            for (pair, count) in counts {
+                *sums.entry(pair).or_insert(0.0) += count;
+            }
+        }
+        Self {
+            steps: steps.into_iter().map(|sums| sums.into_iter().collect()).collect(),
+            latent: TransitionCounts::default(),
+            ..*self
+        }
+    }
+
+    /// `N_k(s,a)` of step `k` = 0, 1, …: rising pairs and how often they were seen there; empty beyond the longest trajectory
+    /// with actions.
     pub fn step_counts(&self, k: usize) -> &[(u32, f64)] {
         self.steps.get(k).map_or(&[], Vec::as_slice)
     }
@@ -192,15 +256,21 @@ impl Statistics {
         self.weighted_counts(horizon.map_or(usize::MAX, |k| k as usize), |_| 1.0)
     }
 
-    /// N(s) of the first `horizon` steps (all where `None`), shape (`n_states`,).
+    /// N(s) of the first `horizon` steps (all where `None`), seen with or without action, shape (`n_states`,).
     pub fn state_visits(&self, horizon: Option<u32>) -> Vec<f64> {
-        self.counts(horizon).chunks_exact(self.n_actions).map(|row| row.iter().sum()).collect()
+        let mut visits: Vec<f64> =
+            self.counts(horizon).chunks_exact(self.n_actions).map(|row| row.iter().sum()).collect();
+        for (_, transition) in self.latent.iter(horizon) {
+            visits[transition.state as usize] += transition.count;
+        }
+        visits
     }
 
-    /// Number of steps among the first `horizon` of each trajectory (all where `None`).
+    /// Number of steps among the first `horizon` of each trajectory (all where `None`), seen with or without action.
     pub fn n_steps(&self, horizon: Option<u32>) -> u64 {
-        let horizon = horizon.map_or(usize::MAX, |k| k as usize);
-        self.steps.iter().take(horizon).flatten().map(|&(_, count)| count as u64).sum()
+        let steps = self.steps.iter().take(horizon.map_or(usize::MAX, |k| k as usize));
+        let counted: f64 = steps.flatten().map(|&(_, count)| count).sum();
+        (counted + self.latent.total(horizon)).round() as u64
     }
 
     /// Number of states that the first `horizon` steps visit (all where `None`).
@@ -305,6 +375,25 @@ mod tests {
         assert!(matches!(refused, Err(StatisticsError::OutOfRange { step: 1, state: 3, .. })));
         assert_eq!(builder.finish(), before);
         assert_eq!(Statistics::builder(3, 2, None).finish(), Err(StatisticsError::Empty));
+    }
+
+    #[test]
+    fn transitions_without_actions_are_counted_apart() {
+        let mut builder = Statistics::builder(3, 2, Some(2));
+        builder.add(&trajectory(&[0, 1], &[1, 0])).expect("counted");
+        builder.add(&Trajectory::states_only(vec![0, 1, 2], Some(0), 9).expect("a trajectory")).expect("counted");
+        let wrong = Trajectory::states_only(vec![0, 1], Some(3), 9).expect("a trajectory");
+        assert_eq!(builder.add(&wrong), Err(StatisticsError::StateOutOfRange { n_states: 3, state: 3, step: 2 }));
+        let statistics = builder.finish().expect("counts");
+        assert_eq!((statistics.n_trajectories(), statistics.longest(), statistics.n_steps(None)), (2, 2, 4));
+        assert_eq!(statistics.counts(None), [0.0, 1.0, 1.0, 0.0, 0.0, 0.0]);
+        assert_eq!(statistics.state_visits(None), [2.0, 2.0, 0.0]);
+        let latent: Vec<_> = statistics.latent().iter(None).map(|(k, t)| (k, t.state, t.next_state)).collect();
+        assert_eq!((latent, statistics.latent().total(Some(1))), (vec![(0, 0, 1), (1, 1, 2)], 1.0));
+        let completed = statistics.completed(vec![vec![(1, 0.5), (0, 0.5)], vec![(3, 1.0)]]);
+        assert_eq!(completed.step_counts(0), [(0, 0.5), (1, 1.5)]);
+        assert_eq!(completed.step_counts(1), [(2, 1.0), (3, 1.0)]);
+        assert!(completed.latent().is_empty());
     }
 
     #[test]

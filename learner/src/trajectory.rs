@@ -1,6 +1,7 @@
 //! Demonstrations: what an expert was seen to do.
 //!
-//! Invariant: a [`Trajectory`] is never ragged or empty, and its indices lie within its process's sizes.
+//! Invariants: a [`Trajectory`] is never ragged or empty, and its indices lie within its process's sizes. Either every step has
+//! its action or none has; without actions the state after the last step is known, so that every step is a transition.
 
 use serde::{Deserialize, Serialize};
 
@@ -14,7 +15,7 @@ pub struct State(pub u32);
 #[serde(transparent)]
 pub struct Action(pub u32);
 
-/// One demonstration: states before each step and the actions taken there. Shape (steps,) each.
+/// One demonstration: states before each step and the actions taken there, shape (steps,) each, or the states alone.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Trajectory {
     states: Vec<u32>,
@@ -28,6 +29,9 @@ pub enum TrajectoryError {
     /// No step.
     #[error("expected at least one step, got none")]
     Empty,
+    /// Without actions, a state that nothing follows.
+    #[error("expected at least two states, the final one included, where there are no actions; got one")]
+    NoTransition,
     /// Lengths differ.
     #[error("expected as many actions as states, got {states} states and {actions} actions")]
     Ragged {
@@ -87,17 +91,49 @@ impl Trajectory {
         Ok(Self { states, actions, final_state })
     }
 
+    /// Checks and keeps a demonstration of which only the states were seen: n states and a final one are n transitions.
+    ///
+    /// Where the final state is missing, the last of `states` is taken for it: n states are n − 1 transitions then.
+    ///
+    /// # Errors
+    /// No transition, states out of range.
+    pub fn states_only(mut states: Vec<u32>, final_state: Option<u32>, n_states: u32) -> Result<Self, TrajectoryError> {
+        if states.is_empty() {
+            return Err(TrajectoryError::Empty);
+        }
+        for (step, &state) in states.iter().chain(&final_state).enumerate() {
+            if state >= n_states {
+                return Err(TrajectoryError::StateOutOfRange { step, state, n_states });
+            }
+        }
+        let final_state = final_state.or_else(|| states.pop());
+        if states.is_empty() {
+            return Err(TrajectoryError::NoTransition);
+        }
+        Ok(Self { states, actions: Vec::new(), final_state })
+    }
+
+    /// False where only the states were seen.
+    pub fn has_actions(&self) -> bool {
+        !self.actions.is_empty()
+    }
+
     /// States before each step, shape (steps,).
     pub fn states(&self) -> &[u32] {
         &self.states
     }
 
-    /// Actions, shape (steps,).
+    /// States after each step, as far as they are known.
+    pub fn next_states(&self) -> impl Iterator<Item = u32> + '_ {
+        self.states[1..].iter().copied().chain(self.final_state)
+    }
+
+    /// Actions, shape (steps,); empty where only the states were seen.
     pub fn actions(&self) -> &[u32] {
         &self.actions
     }
 
-    /// State after the last step, where known.
+    /// State after the last step, where known; always known without actions.
     pub fn final_state(&self) -> Option<u32> {
         self.final_state
     }
@@ -114,7 +150,7 @@ impl Trajectory {
         let n = horizon.clamp(1, self.len());
         Self {
             states: self.states[..n].to_vec(),
-            actions: self.actions[..n].to_vec(),
+            actions: self.actions[..n.min(self.actions.len())].to_vec(),
             final_state: if n < self.len() { Some(self.states[n]) } else { self.final_state },
         }
     }
@@ -191,6 +227,23 @@ mod tests {
         assert_eq!(
             new(&[0, 1], &[1, 2], None),
             Err(TrajectoryError::ActionOutOfRange { step: 1, action: 2, n_actions: 2 })
+        );
+    }
+
+    #[test]
+    fn states_alone_are_transitions() {
+        let with = Trajectory::states_only(vec![0, 1], Some(2), 3).expect("a trajectory");
+        let without = Trajectory::states_only(vec![0, 1, 2], None, 3).expect("a trajectory");
+        assert_eq!(with, without);
+        assert_eq!((with.len(), with.has_actions(), with.final_state()), (2, false, Some(2)));
+        assert_eq!(with.next_states().collect::<Vec<_>>(), [1, 2]);
+        let short = with.truncated(1);
+        assert_eq!((short.states(), short.actions(), short.final_state()), ([0].as_slice(), [].as_slice(), Some(1)));
+        assert_eq!(Trajectory::states_only(vec![], Some(1), 3), Err(TrajectoryError::Empty));
+        assert_eq!(Trajectory::states_only(vec![1], None, 3), Err(TrajectoryError::NoTransition));
+        assert_eq!(
+            Trajectory::states_only(vec![1], Some(3), 3),
+            Err(TrajectoryError::StateOutOfRange { step: 1, state: 3, n_states: 3 })
         );
     }
 

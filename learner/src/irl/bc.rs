@@ -1,6 +1,6 @@
 //! Behaviour cloning: the demonstrated frequencies. The floor that every other method must beat.
 
-use super::{Fit, FitError, Method, Problem, Progress, Stopped, Trace};
+use super::{Fit, FitError, FitOptions, Method, Problem, Progress, Stopped, Trace};
 use crate::mdp::Policy;
 
 /// π(a|s) = (N(s,a) + smoothing) / (N(s) + `n_actions` · smoothing); uniform where a state was never visited.
@@ -13,6 +13,10 @@ impl Method for Bc {
 
     fn description(&self) -> &'static str {
         "behaviour cloning: the demonstrated action frequencies, no reward"
+    }
+
+    fn log_prior(&self, options: &FitOptions, fit: &Fit) -> f64 {
+        if options.smoothing == 0.0 { 0.0 } else { options.smoothing * fit.policy.iter().map(|p| p.ln()).sum::<f64>() }
     }
 
     fn fit(&self, problem: &Problem<'_>, progress: Progress<'_>) -> Result<Fit, FitError> {

@@ -4,15 +4,19 @@
 //! demonstrations pass in step k, the stationarity of their eq. 8 is c − C w = λ 1 on the simplex. The E-step weighs the
 //! steps by the responsibilities ρ_k, the M-step solves for w, and the planner turns R = wᵀΦ into a policy.
 //!
-//! The objective is the part of Q that depends on the reward, cᵀw − ½ wᵀC w. C is diagonal for the Dirac bases offered here.
+//! The objective is the part of Q that depends on the reward, cᵀw − ½ wᵀC w. C is diagonal for the Dirac bases; for a user's
+//! features it is full, see [`em_features`].
 
-use super::{Fit, FitError, MStep, Method, Problem, Progress, Responsibility, Stopped, Trace, nnls, simplex};
+use super::{
+    BasisKind, Fit, FitError, MStep, Method, Problem, Progress, Responsibility, Stopped, Trace, em_features, nnls,
+    simplex,
+};
 use nalgebra::{DMatrix, DVector};
 
 /// Demonstrated basis functions that the dense least-squares problem may hold (512 MB).
 const MAX_DEMONSTRATED: usize = 8000;
 /// Share of the data's weight below which the exact product counts as having lost it.
-const LOST: f64 = 1e-6;
+pub(super) const LOST: f64 = 1e-6;
 
 /// The paper's algorithm.
 pub(super) struct Em;
@@ -34,6 +38,9 @@ impl Method for Em {
         if options.reference_basis as usize >= basis.len() {
             let message = format!("expected a basis function below {}, got {}", basis.len(), options.reference_basis);
             return Err(FitError::InvalidOption { field: "reference_basis", message });
+        }
+        if options.basis == BasisKind::Features {
+            return em_features::fit(problem, &basis, trace);
         }
         let steps = problem.horizon().min(problem.statistics.longest()) as usize;
         let prior = options.horizon_prior.probabilities(options.discount, problem.horizon(), steps);
@@ -69,18 +76,22 @@ impl Method for Em {
 
         let mut warnings = Vec::new();
         if options.responsibility == Responsibility::Exact && kept < LOST {
-            warnings.push(format!(
-                "the exact product of rewards over {} trajectories keeps a share of {kept:.1e} of the data: the weights \
-                 follow 1/counts (all is on what was never demonstrated, where there is any) and not the demonstrations",
-                problem.statistics.n_trajectories()
-            ));
+            warnings.push(lost(kept, problem.statistics.n_trajectories()));
         }
         Fit::planned(problem, &basis, weights, trace, stopped, warnings)
     }
 }
 
+/// What a fit says whose exact product kept next to nothing of the data.
+pub(super) fn lost(kept: f64, n_trajectories: u64) -> String {
+    format!(
+        "the exact product of rewards over {n_trajectories} trajectories keeps a share of {kept:.1e} of the data: the weights \
+         follow 1/counts (all is on what was never demonstrated, where there is any) and not the demonstrations"
+    )
+}
+
 /// ρ_k = Π_l R(s_k, a_k) over the demonstrations, from the sum of logarithms; a reward above 1 counts as 1.
-fn responsibilities(problem: &Problem<'_>, reward: &[f64], steps: usize) -> Vec<f64> {
+pub(super) fn responsibilities(problem: &Problem<'_>, reward: &[f64], steps: usize) -> Vec<f64> {
     (0..steps)
         .map(|k| {
             let counts = problem.statistics.step_counts(k).iter();

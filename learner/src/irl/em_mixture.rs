@@ -2,9 +2,10 @@
 //!
 //! Maximises Σ_l log Σ_k p(k) wᵀΦ(s_k,a_k) over the simplex. With a_l = Σ_k p(k) Φ(s_k,a_k) this is the mixing proportions of a
 //! finite mixture: concave, and EM multiplies w_b by the mean responsibility of b. The stopping rule watches a bound:
-//! by concavity, no w on the simplex is better than the present one by more than max_b g_b − L, g the gradient.
+//! by concavity, no w on the simplex is better than the present one by more than max_b g_b − L, g the gradient. Features may
+//! have any unit but no negative value: wᵀΦ is a likelihood.
 
-use super::{Fit, FitError, Method, Problem, Progress, Stopped, Trace};
+use super::{Fit, FitError, Method, Problem, Progress, Stopped, Trace, em_features};
 use crate::mdp::max_abs;
 use std::collections::BTreeMap;
 
@@ -33,10 +34,12 @@ impl Method for EmMixture {
             .filter(|demonstrations| !demonstrations.is_empty())
             .ok_or(FitError::NeedsDemonstrations { method: self.id() })?;
         let basis = problem.basis();
+        em_features::highest(problem)?;
         let n_actions = problem.mdp.n_actions();
         let steps = problem.horizon().min(problem.statistics.longest()) as usize;
         let prior = options.horizon_prior.probabilities(options.discount, problem.horizon(), steps);
         let mut rows: Vec<Vec<(usize, f64)>> = Vec::with_capacity(demonstrations.len());
+        let mut units = 0.0;
         for trajectory in demonstrations {
             let mut row = BTreeMap::new();
             let pairs = trajectory.states().iter().zip(trajectory.actions());
@@ -52,7 +55,24 @@ impl Method for EmMixture {
                 }
                 basis.for_each(problem.mdp.pair(state, action), |b, value| *row.entry(b).or_insert(0.0) += p * value);
             }
-            rows.push(row.into_iter().collect());
+            // a trajectory's unit changes its likelihood by a constant
+            let unit = row.values().copied().fold(0.0, f64::max);
+            if unit > 0.0 {
+                units += unit.ln();
+                rows.push(row.into_iter().map(|(b, a)| (b, a / unit)).collect());
+            }
+        }
+        let featureless = demonstrations.len() - rows.len();
+        if rows.is_empty() {
+            let message = "expected a feature that is not 0 where the demonstrations go, got none".to_owned();
+            return Err(FitError::InvalidOption { field: "basis", message });
+        }
+        let mut warnings = Vec::new();
+        if featureless > 0 {
+            warnings.push(format!(
+                "all features are 0 along {featureless} of {} trajectories: no reward explains them, they are left out",
+                demonstrations.len()
+            ));
         }
 
         let n_trajectories = rows.len() as f64;
@@ -69,7 +89,7 @@ impl Method for EmMixture {
                 }
             }
             let gap = max_abs(&gradient) - n_trajectories;
-            trace.record(log_likelihood, gap)?;
+            trace.record(log_likelihood + units, gap)?;
             if gap <= options.tolerance {
                 stopped = Stopped::Converged;
                 break;
@@ -79,6 +99,6 @@ impl Method for EmMixture {
             }
         }
 
-        Fit::planned(problem, &basis, weights, trace, stopped, Vec::new())
+        Fit::planned(problem, &basis, weights, trace, stopped, warnings)
     }
 }

@@ -11,8 +11,10 @@ mod birl;
 mod bounded;
 mod diagnostics;
 mod em;
+mod em_features;
 mod em_mixture;
 pub mod em_tied;
+mod latent;
 pub mod nnls;
 mod options;
 mod random;
@@ -21,6 +23,7 @@ mod temperature;
 
 pub use crate::mdp::{HorizonPrior, PlannerKind};
 pub use basis::Basis;
+pub use latent::LatentActions;
 pub use options::{BasisKind, FitOptions, MStep, Penalty, PosteriorKind, Responsibility, RewardPrior};
 
 use self::temperature::most_likely_boltzmann;
@@ -59,7 +62,13 @@ pub trait Method: Sync {
         false
     }
 
-    /// Fits; calls `progress` after every iteration.
+    /// Log-density of the method's prior at a fit, up to a constant: what it adds to the log-likelihood of the demonstrated
+    /// actions, 0 for a method without penalty.
+    fn log_prior(&self, _options: &FitOptions, _fit: &Fit) -> f64 {
+        0.0
+    }
+
+    /// Fits; calls `progress` after every iteration. Use [`fit`], which also takes demonstrations without actions.
     ///
     /// # Errors
     /// Options or data that the method cannot work with, and cancellation by `progress`.
@@ -108,6 +117,33 @@ pub enum FitError {
         /// Its name.
         method: &'static str,
     },
+    /// A method that cannot infer actions that were not seen.
+    #[error("method {method} needs the demonstrations' actions, got demonstrations of states alone")]
+    NeedsActions {
+        /// Its name.
+        method: &'static str,
+    },
+    /// [`Method::fit`] was given demonstrations without actions.
+    #[error("expected demonstrations with actions, got {transitions} transitions without")]
+    LatentActions {
+        /// How many there are.
+        transitions: u64,
+    },
+    /// Demonstrations without actions that the model cannot make.
+    #[error(
+        "expected transitions that an action of the model makes, got {count} that none makes, the first from state {state} to \
+         state {next_state} at step {step}"
+    )]
+    ImpossibleTransitions {
+        /// How many there are.
+        count: u64,
+        /// Step of the first.
+        step: usize,
+        /// Where it begins.
+        state: u32,
+        /// Where it ends.
+        next_state: u32,
+    },
     /// Too large to be solved in memory.
     #[error("expected at most {limit} {what}, got {got}")]
     TooLarge {
@@ -126,6 +162,15 @@ pub enum FitError {
 impl Problem<'_> {
     /// Checks all that the methods have in common.
     fn check(&self) -> Result<(), FitError> {
+        self.check_options()?;
+        match self.statistics.latent().total(None) {
+            0.0 => Ok(()),
+            transitions => Err(FitError::LatentActions { transitions: transitions as u64 }),
+        }
+    }
+
+    /// Checks options and model against each other.
+    fn check_options(&self) -> Result<(), FitError> {
         let (mdp, statistics) = (self.mdp, self.statistics);
         if (mdp.n_states(), mdp.n_actions()) != (statistics.n_states(), statistics.n_actions()) {
             return Err(FitError::Mismatch {
@@ -322,12 +367,16 @@ impl Fit {
     }
 }
 
-/// Fits with a method; the one entry for every caller.
+/// Fits with a method; the one entry for every caller. Actions that were not seen are inferred.
 ///
 /// # Errors
-/// As [`Method::fit`].
+/// As [`Method::fit`]; without actions also transitions that the model cannot make, and methods that need whole trajectories.
 pub fn fit(method: &dyn Method, problem: &Problem<'_>, progress: Progress<'_>) -> Result<Fit, FitError> {
-    method.fit(problem, progress)
+    if problem.statistics.latent().is_empty() {
+        method.fit(problem, progress)
+    } else {
+        latent::fit(method, problem, progress)
+    }
 }
 
 /// Called after every iteration; `Break` cancels the fit.

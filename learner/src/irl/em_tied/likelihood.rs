@@ -1,8 +1,45 @@
 //! Log-likelihood of the soft-optimal policy with its exact gradient and Hessian.
 
-use crate::irl::Basis;
+use super::FiniteLikelihood;
+use crate::irl::{Basis, FitError, Problem};
 use crate::mdp::{Resolvent, SoftSolver, TabularMdp, log_sum_exp};
 use nalgebra::DMatrix;
+
+/// A log-likelihood of soft-optimal behaviour as a function of the weights.
+pub trait SoftLikelihood {
+    /// ℓ(w) and dℓ/dw, shape (`n_basis`,).
+    fn value_and_gradient(&mut self, weights: &[f64]) -> (f64, Vec<f64>);
+
+    /// d²ℓ/dw², shape (`n_basis`, `n_basis`), and for each b the sum of the absolute terms whose differences make its diagonal
+    /// entry: rounding hides anything much smaller.
+    fn hessian_and_terms(&mut self, weights: &[f64]) -> (DMatrix<f64>, Vec<f64>);
+
+    /// Q of the weights last evaluated, shape (`n_states * n_actions`,); of the first step where there is a horizon.
+    fn action_values(&self) -> &[f64];
+
+    /// V of the weights last evaluated, shape (`n_states`,); of the first step where there is a horizon.
+    fn state_values(&self) -> &[f64];
+
+    /// π = exp(Q − V), shape (`n_states * n_actions`,); of the first step where there is a horizon.
+    fn policy(&self) -> &[f64];
+
+    /// True where the values satisfy their equation.
+    fn converged(&self) -> bool;
+}
+
+/// The likelihood that a problem asks for: over all time, or over K steps where the discount is 1.
+pub(in crate::irl) fn of<'a>(
+    problem: &Problem<'a>,
+    basis: &'a Basis,
+) -> Result<Box<dyn SoftLikelihood + 'a>, FitError> {
+    let (mdp, options) = (problem.mdp, problem.options);
+    Ok(if options.discount < 1.0 {
+        let counts = problem.statistics.counts(options.horizon);
+        Box::new(Likelihood::new(mdp, basis, counts, options.discount))
+    } else {
+        Box::new(FiniteLikelihood::new(mdp, basis, problem.statistics, problem.horizon())?)
+    })
+}
 
 /// ℓ(w) = Σ_{s,a} N(s,a) log π_w(a|s) of given counts. Warm-starts the soft values from one call to the next.
 pub struct Likelihood<'a> {
@@ -96,5 +133,31 @@ impl<'a> Likelihood<'a> {
     /// Soft values and policy of the weights last evaluated.
     pub fn solver(&self) -> &SoftSolver<'a> {
         &self.solver
+    }
+}
+
+impl SoftLikelihood for Likelihood<'_> {
+    fn value_and_gradient(&mut self, weights: &[f64]) -> (f64, Vec<f64>) {
+        Likelihood::value_and_gradient(self, weights)
+    }
+
+    fn hessian_and_terms(&mut self, weights: &[f64]) -> (DMatrix<f64>, Vec<f64>) {
+        Likelihood::hessian_and_terms(self, weights)
+    }
+
+    fn action_values(&self) -> &[f64] {
+        self.solver.action_values()
+    }
+
+    fn state_values(&self) -> &[f64] {
+        self.solver.state_values()
+    }
+
+    fn policy(&self) -> &[f64] {
+        self.solver.policy()
+    }
+
+    fn converged(&self) -> bool {
+        self.solver.converged()
     }
 }

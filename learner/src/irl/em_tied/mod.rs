@@ -8,14 +8,16 @@
 //! The greedy policy takes the best actions under the soft Q itself, not those of a hard planner on the learned reward: the
 //! two agree where the reward is large against the temperature, and where data are few the soft one follows them better.
 
+mod finite;
 mod likelihood;
 mod standard_errors;
 
-pub use likelihood::Likelihood;
+pub use finite::FiniteLikelihood;
+pub use likelihood::{Likelihood, SoftLikelihood};
 pub use standard_errors::{MAX_STANDARD_ERRORS, standard_errors};
 
 use super::bounded::{self, Settings};
-use super::{Basis, Fit, FitError, Method, Penalty, PlannerKind, Problem, Progress, Trace};
+use super::{Basis, Fit, FitError, FitOptions, Method, Penalty, PlannerKind, Problem, Progress, Trace};
 use crate::mdp::Policy;
 
 /// The policy tied to the reward.
@@ -30,6 +32,15 @@ impl Method for EmTied {
         "maximum likelihood of the soft-optimal policy, penalised; the most accurate"
     }
 
+    fn log_prior(&self, options: &FitOptions, fit: &Fit) -> f64 {
+        let strength = options.penalty_strength.unwrap_or(1.0);
+        match options.penalty {
+            Penalty::L1 => -strength * fit.weights.iter().sum::<f64>(),
+            Penalty::L2 => -0.5 * strength * fit.weights.iter().map(|w| w * w).sum::<f64>(),
+            Penalty::None => 0.0,
+        }
+    }
+
     fn fit(&self, problem: &Problem<'_>, progress: Progress<'_>) -> Result<Fit, FitError> {
         fit_with_basis(problem, &problem.basis(), progress)
     }
@@ -38,17 +49,13 @@ impl Method for EmTied {
 /// Fits with any basis; `problem.options.basis` is not looked at.
 ///
 /// # Errors
-/// As [`Method::fit`]; the discount must lie below 1, for soft values over all time have no limit at 1.
+/// As [`Method::fit`]. With a discount of 1 the policy is the one of K steps, K the options' horizon or the longest
+/// trajectory's, and the fit's policy and values are those of the first step.
 pub fn fit_with_basis(problem: &Problem<'_>, basis: &Basis, progress: Progress<'_>) -> Result<Fit, FitError> {
     problem.check()?;
     let options = problem.options;
-    if options.discount >= 1.0 {
-        let message = format!("expected a number below 1 for em-tied, got {}", options.discount);
-        return Err(FitError::InvalidOption { field: "discount", message });
-    }
     let mut trace = Trace::new(progress);
-    let counts = problem.statistics.counts(options.horizon);
-    let mut likelihood = Likelihood::new(problem.mdp, basis, counts, options.discount);
+    let mut likelihood = likelihood::of(problem, basis)?;
     let strength = options.penalty_strength.unwrap_or(1.0);
     let settings = Settings {
         lower: if options.penalty == Penalty::L1 { 0.0 } else { f64::NEG_INFINITY },
@@ -90,7 +97,7 @@ pub fn fit_with_basis(problem: &Problem<'_>, basis: &Basis, progress: Progress<'
     let mut errors = None;
     if options.penalty == Penalty::None {
         if basis.len() <= MAX_STANDARD_ERRORS {
-            let found = standard_errors(&mut likelihood, &weights);
+            let found = standard_errors(&mut *likelihood, &weights);
             let undetermined = found.iter().filter(|e| e.is_infinite()).count();
             if undetermined > 0 {
                 warnings.push(format!(
@@ -106,17 +113,16 @@ pub fn fit_with_basis(problem: &Problem<'_>, basis: &Basis, progress: Progress<'
             ));
         }
     }
-    let soft = likelihood.solver();
-    if !soft.converged() {
+    if !likelihood.converged() {
         warnings.push("the soft values stopped before they converged".to_owned());
     }
     let n_actions = problem.mdp.n_actions();
     let iterations = trace.entries.len() as u32;
     Ok(Fit {
         reward: basis.reward(&weights),
-        policy: Policy::boltzmann(n_actions, soft.action_values(), 1.0).into_probabilities(),
-        greedy_policy: Policy::greedy(n_actions, soft.action_values()).into_probabilities(),
-        state_values: soft.state_values().to_vec(),
+        policy: Policy::boltzmann(n_actions, likelihood.action_values(), 1.0).into_probabilities(),
+        greedy_policy: Policy::greedy(n_actions, likelihood.action_values()).into_probabilities(),
+        state_values: likelihood.state_values().to_vec(),
         standard_errors: errors,
         posterior: None,
         hyperparameters: Vec::new(),

@@ -1,6 +1,6 @@
 //! Standard errors of the unpenalised estimator from the observed information.
 
-use super::Likelihood;
+use super::SoftLikelihood;
 use nalgebra::SymmetricEigen;
 
 /// Most basis functions whose Hessian is decomposed.
@@ -16,7 +16,7 @@ const HIDDEN: f64 = 0.1;
 ///
 /// A reward is identified only up to directions that leave the policy unchanged (a constant, unvisited states). A weight with
 /// a part in such a direction has an infinite standard error: it is undetermined.
-pub fn standard_errors(likelihood: &mut Likelihood<'_>, weights: &[f64]) -> Vec<f64> {
+pub fn standard_errors(likelihood: &mut dyn SoftLikelihood, weights: &[f64]) -> Vec<f64> {
     let (hessian, terms) = likelihood.hessian_and_terms(weights);
     let information = -hessian;
     // scaled to a unit diagonal, so that the rank does not depend on the features' units

@@ -189,6 +189,18 @@ impl Statistics {
         StatisticsBuilder::new(n_states, n_actions, horizon)
     }
 
+    /// As if every trajectory had been seen `times` times.
+    #[must_use]
+    pub fn repeated(&self, times: u64) -> Self {
+        let mut repeated = self.clone();
+        repeated.n_trajectories = self.n_trajectories.saturating_mul(times);
+        repeated.latent.scale(times as f64);
+        for (_, count) in repeated.steps.iter_mut().flatten() {
+            *count *= times as f64;
+        }
+        repeated
+    }
+
     /// Number of states.
     pub fn n_states(&self) -> usize {
         self.n_states

@@ -57,6 +57,13 @@ impl TransitionCounts {
         self.steps.len()
     }
 
+    /// Multiplies every count.
+    pub(crate) fn scale(&mut self, factor: f64) {
+        for transition in self.steps.iter_mut().flatten() {
+            transition.count *= factor;
+        }
+    }
+
     /// `N_k(s,s')` of step `k` = 0, 1, …; empty beyond the last.
     pub fn step(&self, k: usize) -> &[TransitionCount] {
         self.steps.get(k).map_or(&[], Vec::as_slice)

@@ -191,7 +191,7 @@ async fn each_wrong_field_of_a_trajectory_is_named() {
         ("n_actions", |t| t.n_actions = u32::MAX),
         ("states", |t| t.states = vec![0; 13].into()),
         ("states", |t| t.states = pack([-1_i32, 0, 0])),
-        ("actions", |t| t.actions.clear()),
+        ("actions", |t| t.actions = t.actions.slice(4..)),
         ("rewards", |t| t.rewards = pack([f64::NAN; 3])),
         ("final_state", |t| t.final_state = Some(57)),
     ];

@@ -44,7 +44,7 @@ pub struct Demonstration {
     pub n_actions: u32,
     /// State before each step, shape (steps,).
     pub states: Vec<u32>,
-    /// Action of each step, shape (steps,).
+    /// Action of each step, shape (steps,); empty where only the states were seen.
     pub actions: Vec<u32>,
     /// Reward of each step, shape (steps,); empty where unknown.
     pub rewards: Vec<f64>,
@@ -320,8 +320,11 @@ fn check(trajectory: &pb::Trajectory) -> Result<(), ClientError> {
     if steps == 0 || !trajectory.states.len().is_multiple_of(4) {
         return wrong("states", format!("expected at least one step, got {} bytes", trajectory.states.len()));
     }
-    if trajectory.actions.len() != steps * 4 {
-        return wrong("actions", format!("expected {steps} actions, got {}", trajectory.actions.len() / 4));
+    if trajectory.actions.is_empty() && steps == 1 && trajectory.final_state.is_none() {
+        return wrong("states", "expected at least two states where there are no actions, got one".to_owned());
+    }
+    if !trajectory.actions.is_empty() && trajectory.actions.len() != steps * 4 {
+        return wrong("actions", format!("expected {steps} actions or none, got {}", trajectory.actions.len() / 4));
     }
     if !trajectory.rewards.is_empty() && trajectory.rewards.len() != steps * 8 {
         return wrong("rewards", format!("expected {steps} rewards or none, got {}", trajectory.rewards.len() / 8));
@@ -367,7 +370,9 @@ mod tests {
     #[test]
     fn what_is_no_trajectory_is_refused_before_it_travels() {
         assert!(check(&demonstration().into()).is_ok());
-        let cases: [(&str, Change); 5] = [
+        assert!(check(&Demonstration { actions: Vec::new(), ..demonstration() }.into()).is_ok());
+        let cases: [(&str, Change); 6] = [
+            ("states", |d| (d.states, d.actions) = (vec![1], Vec::new())),
             ("states", |d| d.states.clear()),
             ("states", |d| d.states[1] = 3),
             ("actions", |d| d.actions.push(0)),

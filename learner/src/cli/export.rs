@@ -138,7 +138,7 @@ fn write_csv(t: &pb::Trajectory, value: &Value, out: &mut (dyn Write + Send)) ->
             t.n_states,
             t.n_actions,
             value["states"][step],
-            value["actions"][step],
+            cell(&value["actions"][step]),
             cell(&value["rewards"][step]),
             last && t.terminated,
             last && t.truncated,

@@ -244,9 +244,10 @@ fn trajectory_text(t: &pb::Trajectory) -> Result<String, CliError> {
         ("then", ended.into()),
     ]);
     text.push('\n');
-    let rows = states.iter().zip(&actions).enumerate().take(MOST_ROWS).map(|(step, (state, action))| {
+    let rows = states.iter().enumerate().take(MOST_ROWS).map(|(step, state)| {
+        let action = actions.get(step).map(u32::to_string).unwrap_or_default();
         let reward = rewards.get(step).map(f64::to_string).unwrap_or_default();
-        [step.to_string(), state.to_string(), action.to_string(), reward]
+        [step.to_string(), state.to_string(), action, reward]
     });
     text.push_str(&table(["#step", "#state", "#action", "#reward"], rows));
     text.push('\n');

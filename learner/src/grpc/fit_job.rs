@@ -4,7 +4,7 @@ use super::{from_proto, options, status::CallError};
 use crate::{
     config::Limits,
     eval,
-    irl::{self, FitError, FitOptions, Method, Problem, TraceEntry},
+    irl::{self, FitError, FitOptions, LatentActions, Method, Problem, TraceEntry},
     mdp::TabularMdp,
     statistics::{Statistics, StatisticsBuilder},
     store::{FieldError, Filter, Model, Recording, Store, check_model_id, clip, pack_f64, unpack_f64, unpack_u32},
@@ -86,7 +86,8 @@ impl FitJob {
         };
         let begun = Instant::now();
         let fit = irl::fit(self.method, &problem, &mut progress).map_err(refused)?;
-        Ok(self.describe(&model, data, &fit, begun.elapsed().as_secs_f64()))
+        let judged = judge(&mdp, &data.statistics, &fit)?;
+        Ok(self.describe(&model, data, &fit, judged, begun.elapsed().as_secs_f64()))
     }
 
     /// Streams the trajectories through the counts.
@@ -112,8 +113,7 @@ impl FitJob {
         gathering.finish()
     }
 
-    fn describe(self, model: &Model, data: Data, fit: &irl::Fit, fit_secs: f64) -> pb::Fit {
-        let counts = data.statistics.counts(None);
+    fn describe(self, model: &Model, data: Data, fit: &irl::Fit, judged: Judged, fit_secs: f64) -> pb::Fit {
         pb::Fit {
             fit_id: Uuid::new_v4().to_string(),
             created_at: None,
@@ -137,12 +137,35 @@ impl FitJob {
             iterations: fit.iterations,
             fit_secs,
             warnings: fit.warnings.clone(),
-            log_likelihood_per_step: eval::log_likelihood_per_step(&fit.policy, &counts),
-            agreement: eval::step_agreement(&fit.greedy_policy, &counts),
+            log_likelihood_per_step: judged.log_likelihood_per_step,
+            agreement: judged.agreement,
             states_covered: data.statistics.states_covered(None) as u32,
             request: Some(self.request),
         }
     }
+}
+
+/// How well a fit explains the data that it was made from.
+struct Judged {
+    log_likelihood_per_step: f64,
+    agreement: f64,
+}
+
+/// Where actions were not seen, the likelihood is that of the transitions, and the agreement an expected one.
+fn judge(mdp: &TabularMdp, statistics: &Statistics, fit: &irl::Fit) -> Result<Judged, CallError> {
+    if statistics.latent().is_empty() {
+        let counts = statistics.counts(None);
+        return Ok(Judged {
+            log_likelihood_per_step: eval::log_likelihood_per_step(&fit.policy, &counts),
+            agreement: eval::step_agreement(&fit.greedy_policy, &counts),
+        });
+    }
+    let latent = LatentActions::new(mdp, statistics, None).map_err(refused)?;
+    let steps = statistics.n_steps(None) as f64;
+    Ok(Judged {
+        log_likelihood_per_step: latent.log_likelihood(&fit.policy) / steps,
+        agreement: eval::step_agreement(&fit.greedy_policy, &latent.complete(&fit.policy).counts(None)),
+    })
 }
 
 /// Model and data must belong to processes of one size.
@@ -300,6 +323,12 @@ fn refused(error: FitError) -> CallError {
             CallError::Limit { field: "model_id".into(), what, limit: limit as u64, got: got as u64 }
         }
         FitError::Plan(error) => CallError::field("options.planner", error.to_string()),
-        FitError::Mismatch { .. } | FitError::NeedsDemonstrations { .. } => CallError::Internal(error.to_string()),
+        FitError::NeedsActions { .. } => CallError::field("method", error.to_string()),
+        FitError::ImpossibleTransitions { .. } => {
+            CallError::Precondition { kind: "IMPOSSIBLE_TRANSITIONS", field: "filter", message: error.to_string() }
+        }
+        FitError::Mismatch { .. } | FitError::NeedsDemonstrations { .. } | FitError::LatentActions { .. } => {
+            CallError::Internal(error.to_string())
+        }
     }
 }

@@ -1,6 +1,6 @@
 //! A trajectory as it is stored: checked, packed, with where it came from.
 //!
-//! Invariants of a [`Recording`]: at least one step; as many actions as states; indices within the sizes; rewards as
+//! Invariants of a [`Recording`]: at least one step; as many actions as states, or none and then two states at least; indices within the sizes; rewards as
 //! many as steps, or none, and finite. Arrays stay packed from the wire to the disk: they are checked, never copied.
 
 use crate::trajectory::Trajectory;
@@ -33,7 +33,7 @@ pub struct Collection {
 pub struct Arrays {
     /// State before each step, 32-bit integers, shape (steps,).
     pub states: Bytes,
-    /// Action of each step, 32-bit integers, shape (steps,).
+    /// Action of each step, 32-bit integers, shape (steps,); empty where only the states were seen.
     pub actions: Bytes,
     /// Reward of each step, IEEE 754 doubles, shape (steps,) or empty.
     pub rewards: Bytes,
@@ -98,9 +98,14 @@ impl Recording {
             let message = format!("expected 4 bytes a step and at least one step, got {} bytes", arrays.states.len());
             return Err(FieldError::new("states", message));
         }
-        if arrays.actions.len() != arrays.states.len() {
+        if arrays.actions.is_empty() && steps == 1 && arrays.final_state.is_none() {
+            let message = "expected at least two states, the final one included, where there are no actions; got one";
+            return Err(FieldError::new("states", message));
+        }
+        if !arrays.actions.is_empty() && arrays.actions.len() != arrays.states.len() {
             let (expected, got) = (arrays.states.len(), arrays.actions.len());
-            return Err(FieldError::new("actions", format!("expected {expected} bytes for {steps} steps, got {got}")));
+            let message = format!("expected {expected} bytes for {steps} steps, or none, got {got}");
+            return Err(FieldError::new("actions", message));
         }
         check_indices("states", &arrays.states, *n_states)?;
         check_indices("actions", &arrays.actions, *n_actions)?;
@@ -153,9 +158,15 @@ impl Recording {
         (self.id, self.collection, self.seed, self.arrays)
     }
 
-    /// Number of steps.
+    /// False where only the states were seen.
+    pub fn has_actions(&self) -> bool {
+        !self.arrays.actions.is_empty()
+    }
+
+    /// Number of steps; without actions the number of transitions.
     pub fn steps(&self) -> u32 {
-        (self.arrays.states.len() / 4) as u32
+        let states = (self.arrays.states.len() / 4) as u32;
+        if self.has_actions() || self.arrays.final_state.is_some() { states } else { states - 1 }
     }
 
     /// Bytes of the arrays, for limits.
@@ -165,6 +176,10 @@ impl Recording {
 
     /// Unpacked, for the mathematics.
     pub fn trajectory(&self) -> Result<Trajectory, crate::trajectory::TrajectoryError> {
+        if !self.has_actions() {
+            let states = unpack_u32(&self.arrays.states).collect();
+            return Trajectory::states_only(states, self.arrays.final_state, self.collection.n_states);
+        }
         Trajectory::new(
             unpack_u32(&self.arrays.states).collect(),
             unpack_u32(&self.arrays.actions).collect(),
@@ -303,6 +318,22 @@ mod tests {
             let error = Recording::new(id, collection, seed, arrays).unwrap_err();
             assert_eq!(error.field, field, "{error}");
         }
+    }
+
+    #[test]
+    fn states_alone_are_a_recording() {
+        let (id, collection, seed, arrays) = parts();
+        let alone = |states: &[u32], final_state| {
+            let states = Arrays { states: pack_u32(states), final_state, ..Arrays::default() };
+            Recording::new(id, collection.clone(), seed, states)
+        };
+        let with = alone(&[0, 4], Some(2)).expect("a recording");
+        let without = alone(&[0, 4, 2], None).expect("a recording");
+        assert_eq!((with.steps(), without.steps()), (2, 2));
+        assert_eq!(with.trajectory(), without.trajectory());
+        assert!(!with.has_actions() && with.trajectory().is_ok_and(|t| !t.has_actions()));
+        assert_eq!(alone(&[0], None).expect_err("no step").field, "states");
+        assert!(Recording::new(id, collection.clone(), seed, arrays).expect("a recording").has_actions());
     }
 
     #[test]

@@ -16,7 +16,7 @@ from mazeway.errors import InvalidArgumentError
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """The states an expert was in and the actions it took there."""
+    """The states an expert was in and the actions it took there, or the states alone."""
 
     env_id: str
     style: str
@@ -24,8 +24,8 @@ class Trajectory:
     n_actions: int
     #: State before each step, shape (steps,).
     states: npt.NDArray[np.int32]
-    #: Action of each step, shape (steps,).
-    actions: npt.NDArray[np.int32]
+    #: Action of each step, shape (steps,); None where only the states were seen.
+    actions: npt.NDArray[np.int32] | None
     #: Reward of each step, shape (steps,); None where unknown.
     rewards: npt.NDArray[np.float64] | None = None
     #: State after the last step; None where unknown.
@@ -44,7 +44,12 @@ class Trajectory:
         """Raises InvalidArgumentError for ragged, empty or out-of-range arrays."""
         if not len(self.states):
             raise InvalidArgumentError("states: expected at least one step", field="states")
-        if len(self.actions) != len(self.states):
+        if self.actions is None:
+            if len(self.states) == 1 and self.final_state is None:
+                raise InvalidArgumentError(
+                    "states: expected at least two where there are no actions, got one", field="states"
+                )
+        elif len(self.actions) != len(self.states):
             raise InvalidArgumentError(
                 f"actions: expected {len(self.states)}, as many as states, got {len(self.actions)}",
                 field="actions",
@@ -53,6 +58,8 @@ class Trajectory:
             ("states", self.states, self.n_states),
             ("actions", self.actions, self.n_actions),
         ):
+            if values is None:
+                continue
             low, high = int(np.min(values)), int(np.max(values))
             if low < 0 or high >= size:
                 raise InvalidArgumentError(
@@ -60,8 +67,8 @@ class Trajectory:
                 )
 
     def __len__(self) -> int:
-        """Number of steps, at least 1."""
-        return len(self.states)
+        """Number of steps, at least 1; without actions the number of transitions."""
+        return len(self.states) - (self.actions is None and self.final_state is None)
 
     def __repr__(self) -> str:
         """What it is, without the arrays."""
@@ -82,10 +89,11 @@ class Trajectory:
             n_states=self.n_states,
             n_actions=self.n_actions,
             states=_arrays.pack(self.states, _arrays.INT32, steps, "states"),
-            actions=_arrays.pack(self.actions, _arrays.INT32, steps, "actions"),
             terminated=self.terminated,
             truncated=self.truncated,
         )
+        if self.actions is not None:
+            message.actions = _arrays.pack(self.actions, _arrays.INT32, steps, "actions")
         if self.rewards is not None:
             message.rewards = _arrays.pack(self.rewards, _arrays.FLOAT64, steps, "rewards")
         if self.final_state is not None:
@@ -103,7 +111,7 @@ class Trajectory:
             n_states=message.n_states,
             n_actions=message.n_actions,
             states=_arrays.unpack(message.states, _arrays.INT32),
-            actions=_arrays.unpack(message.actions, _arrays.INT32),
+            actions=_arrays.unpack(message.actions, _arrays.INT32) if message.actions else None,
             rewards=_arrays.unpack(message.rewards, _arrays.FLOAT64) if message.rewards else None,
             final_state=message.final_state if message.HasField("final_state") else None,
             terminated=message.terminated,

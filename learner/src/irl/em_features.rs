@@ -7,7 +7,7 @@
 //! (Wolfe 1976). Scaling that point's weights so that they minimise ‖(A − b 1ᵀ) u‖² + (1ᵀu − 1)² over u ≥ 0 changes no ratio.
 
 use super::em::{LOST, lost, responsibilities};
-use super::{Basis, Fit, FitError, MStep, Problem, Responsibility, Stopped, Trace, nnls};
+use super::{Basis, BasisKind, Fit, FitError, MStep, Problem, Responsibility, Stopped, Trace, nnls};
 use nalgebra::{DMatrix, DVector};
 
 /// Features that dense matrices may have on either side (128 MB each).
@@ -78,13 +78,13 @@ pub(super) fn fit(problem: &Problem<'_>, basis: &Basis, mut trace: Trace<'_>) ->
     Fit::planned(problem, basis, weights, trace, stopped, warnings)
 }
 
-/// The highest value of any feature.
+/// The highest value of any feature; 0 for a Dirac basis.
 ///
 /// # Errors
 /// A negative one.
 pub(super) fn highest(problem: &Problem<'_>) -> Result<f64, FitError> {
     let mut highest: f64 = 0.0;
-    let Some(features) = problem.features else { return Ok(highest) };
+    let (BasisKind::Features, Some(features)) = (problem.options.basis, problem.features) else { return Ok(highest) };
     for pair in 0..features.n_pairs() {
         let (columns, values) = features.row(pair);
         for (&column, &value) in columns.iter().zip(values) {

@@ -3,12 +3,14 @@
 //! Invariants: results go to standard output, everything else to standard error; a failure is one `error:` line and one
 //! `hint:` line; a closed pipe ends the program quietly.
 
+mod compare;
 mod connect;
 pub mod embedded;
 pub mod error;
 mod export;
 pub mod fit;
 mod list;
+mod scene;
 mod serve;
 mod show;
 mod table;
@@ -31,6 +33,8 @@ struct Cli {
 enum Command {
     /// Learn a reward and a policy from demonstrations, and report what was learned
     Fit(Box<fit::FitArgs>),
+    /// Compare methods on the same demonstrations, over numbers of demonstrations and seeds
+    Compare(Box<compare::CompareArgs>),
     /// List recordings, models and fits
     List(list::ListArgs),
     /// Show a fit, a trajectory or a model
@@ -100,6 +104,7 @@ pub fn main() -> ExitCode {
 async fn run(command: Command) -> Result<(), CliError> {
     match command {
         Command::Fit(args) => fit::run(*args).await,
+        Command::Compare(args) => compare::run(*args).await,
         Command::List(args) => list::run(args).await,
         Command::Show(args) => show::run(args).await,
         Command::Export(args) => export::export(args).await,

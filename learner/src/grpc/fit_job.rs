@@ -126,6 +126,8 @@ impl FitJob {
             trajectory_ids: data.trajectory_ids,
             steps: data.statistics.n_steps(None),
             weights: pack_f64(&fit.weights),
+            posterior: fit.posterior.as_ref().map(posterior_message),
+            hyperparameters: fit.hyperparameters.iter().map(hyperparameter_message).collect(),
             standard_errors: fit.standard_errors.as_deref().map(pack_f64).unwrap_or_default(),
             reward: pack_f64(&fit.reward),
             policy: pack_f64(&fit.policy),
@@ -190,6 +192,27 @@ pub fn progress_message(entry: &TraceEntry) -> pb::FitProgress {
         change: entry.change,
         elapsed_secs: entry.elapsed_secs,
     }
+}
+
+/// A posterior on the wire.
+fn posterior_message(posterior: &irl::Posterior) -> pb::Posterior {
+    pb::Posterior {
+        standard_deviations: pack_f64(&posterior.standard_deviations),
+        low: pack_f64(&posterior.low),
+        high: pack_f64(&posterior.high),
+        diagnostics: posterior.diagnostics.as_ref().map(|diagnostics| pb::Diagnostics {
+            chains: diagnostics.chains,
+            draws: diagnostics.draws,
+            acceptance: diagnostics.acceptance,
+            split_rhat: pack_f64(&diagnostics.split_rhat),
+            effective_sample_size: pack_f64(&diagnostics.effective_sample_size),
+        }),
+    }
+}
+
+/// A learned number on the wire.
+fn hyperparameter_message(hyperparameter: &irl::Hyperparameter) -> pb::Hyperparameter {
+    pb::Hyperparameter { name: hyperparameter.name.clone(), value: hyperparameter.value }
 }
 
 /// Trajectories as they come in.

@@ -1,7 +1,10 @@
 //! Options of a fit, from the wire and back with the defaults filled in.
 
 use crate::{
-    irl::{BasisKind, FitOptions, HorizonPrior, MStep, Penalty, PlannerKind, Responsibility, Stopped},
+    irl::{
+        BasisKind, FitOptions, HorizonPrior, MStep, Penalty, PlannerKind, PosteriorKind, Responsibility, RewardPrior,
+        Stopped,
+    },
     store::FieldError,
 };
 use mazeway_proto::learner as pb;
@@ -23,6 +26,7 @@ pub fn from_proto(message: Option<&pb::FitOptions>) -> Result<FitOptions, FieldE
         basis: match known("basis", m.basis)? {
             pb::Basis::Unspecified | pb::Basis::State => BasisKind::State,
             pb::Basis::StateAction => BasisKind::StateAction,
+            pb::Basis::Features => BasisKind::Features,
         },
         m_step: match known("m_step", m.m_step)? {
             pb::MStep::Unspecified | pb::MStep::Nnls => MStep::Nnls,
@@ -45,6 +49,22 @@ pub fn from_proto(message: Option<&pb::FitOptions>) -> Result<FitOptions, FieldE
             pb::Penalty::None => Penalty::None,
         },
         penalty_strength: m.penalty_strength,
+        posterior: match known("posterior", m.posterior)? {
+            pb::PosteriorKind::Unspecified => default.posterior,
+            pb::PosteriorKind::None => PosteriorKind::None,
+            pb::PosteriorKind::Laplace => PosteriorKind::Laplace,
+            pb::PosteriorKind::Hmc => PosteriorKind::Hmc,
+        },
+        reward_prior: match known("reward_prior", m.reward_prior)? {
+            pb::RewardPrior::Unspecified => default.reward_prior,
+            pb::RewardPrior::Uniform => RewardPrior::Uniform,
+            pb::RewardPrior::Exponential => RewardPrior::Exponential,
+            pb::RewardPrior::Beta => RewardPrior::Beta,
+        },
+        rationality: m.rationality.unwrap_or(default.rationality),
+        chains: m.chains.unwrap_or(default.chains),
+        draws: m.draws,
+        warm_up: m.warm_up,
         tolerance: m.tolerance.unwrap_or(default.tolerance),
         max_iterations: m.max_iterations.unwrap_or(default.max_iterations),
         smoothing: m.smoothing.unwrap_or(default.smoothing),
@@ -71,6 +91,7 @@ pub fn to_proto(options: &FitOptions) -> pb::FitOptions {
         basis: match options.basis {
             BasisKind::State => pb::Basis::State,
             BasisKind::StateAction => pb::Basis::StateAction,
+            BasisKind::Features => pb::Basis::Features,
         } as i32,
         m_step: match options.m_step {
             MStep::Nnls => pb::MStep::Nnls,
@@ -93,6 +114,20 @@ pub fn to_proto(options: &FitOptions) -> pb::FitOptions {
             Penalty::None => pb::Penalty::None,
         } as i32,
         penalty_strength: options.penalty_strength,
+        posterior: match options.posterior {
+            PosteriorKind::None => pb::PosteriorKind::None,
+            PosteriorKind::Laplace => pb::PosteriorKind::Laplace,
+            PosteriorKind::Hmc => pb::PosteriorKind::Hmc,
+        } as i32,
+        reward_prior: match options.reward_prior {
+            RewardPrior::Uniform => pb::RewardPrior::Uniform,
+            RewardPrior::Exponential => pb::RewardPrior::Exponential,
+            RewardPrior::Beta => pb::RewardPrior::Beta,
+        } as i32,
+        rationality: Some(options.rationality),
+        chains: Some(options.chains),
+        draws: options.draws,
+        warm_up: options.warm_up,
         tolerance: Some(options.tolerance),
         max_iterations: Some(options.max_iterations),
         smoothing: Some(options.smoothing),
@@ -141,6 +176,12 @@ mod tests {
             reference_basis: 3,
             penalty: Penalty::None,
             penalty_strength: Some(0.25),
+            posterior: PosteriorKind::Laplace,
+            reward_prior: RewardPrior::Beta,
+            rationality: 3.0,
+            chains: 2,
+            draws: Some(100),
+            warm_up: Some(50),
             tolerance: 1e-9,
             max_iterations: 5,
             smoothing: 0.5,

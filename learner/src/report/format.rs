@@ -193,7 +193,9 @@ pub(crate) fn options(report: &Report) -> Vec<(&'static str, String)> {
     }
     if method == "em-tied" {
         pairs.push(("penalty", option_name(options.penalty)));
-        pairs.push(("penalty strength", options.penalty_strength.to_string()));
+        let strength = options.penalty_strength.map_or_else(|| "the method's own".to_owned(), |s| s.to_string());
+        pairs.push(("penalty strength", strength));
+        pairs.push(("posterior", option_name(options.posterior)));
     }
     if method == "bc" {
         pairs.push(("smoothing", options.smoothing.to_string()));

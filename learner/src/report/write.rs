@@ -46,7 +46,10 @@ fn raster(picture: &Picture) -> Result<Vec<u8>, ReportError> {
 }
 
 /// Puts a file in its place in one step.
-fn replace(directory: &Path, name: &str, content: &[u8]) -> Result<PathBuf, ReportError> {
+///
+/// # Errors
+/// It cannot be written.
+pub fn replace(directory: &Path, name: &str, content: &[u8]) -> Result<PathBuf, ReportError> {
     let path = directory.join(name);
     let temporary = directory.join(format!(".{name}.{}.tmp", uuid::Uuid::new_v4()));
     let put = || {

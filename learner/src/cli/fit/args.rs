@@ -1,68 +1,9 @@
 //! Flags of `learner fit`, as typed. Nothing here is checked against anything but itself.
 
+use super::learning::{self, LearningArgs};
 use crate::cli::StoreArgs;
-use clap::{Args, ValueEnum};
+use clap::Args;
 use std::path::PathBuf;
-
-/// Prior over the number of steps.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub enum HorizonPriorArg {
-    /// (1 - discount) discount^(k-1), normalised over 1..horizon
-    Geometric,
-    /// 1 / horizon
-    Uniform,
-}
-
-/// Basis functions of the reward.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub enum BasisArg {
-    /// One function a state
-    State,
-    /// One function a state-action pair
-    StateAction,
-}
-
-/// Reward step of `em`.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub enum MStepArg {
-    /// Non-negative least squares on the stationarity conditions
-    Nnls,
-    /// Exact maximiser on the simplex
-    Simplex,
-}
-
-/// Responsibilities of `em`.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub enum ResponsibilityArg {
-    /// One for every horizon
-    Approximate,
-    /// The product of the rewards along the demonstrations
-    Exact,
-}
-
-/// Planner that turns the reward into a policy.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub enum PlannerArg {
-    /// Value iteration
-    ValueIteration,
-    /// Policy iteration
-    PolicyIteration,
-    /// Soft (maximum entropy) value iteration
-    SoftValueIteration,
-    /// Expectation maximisation over a mixture of horizons (Toussaint and Storkey 2006)
-    ExpectationMaximization,
-}
-
-/// Penalty on the weights of `em-tied`.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub enum PenaltyArg {
-    /// Strength times the sum of the weights, which are not negative
-    L1,
-    /// Half the strength times the sum of the squared weights, which are free
-    L2,
-    /// None, free weights: maximum likelihood
-    None,
-}
 
 /// What `learner fit` takes.
 #[derive(Debug, Clone, Args)]
@@ -79,8 +20,9 @@ pub struct FitArgs {
     /// What the demonstrators were after [default: the environment's first style]
     #[arg(long, value_name = "NAME")]
     pub style: Option<String>,
-    /// Method: em-tied, em, em-mixture or bc
-    #[arg(long, default_value = "em-tied", value_name = "NAME", help_heading = "Learning")]
+    /// Method
+    #[arg(long, default_value = learning::default_method(), value_name = "NAME", help = learning::method_help(),
+          help_heading = "Learning")]
     pub method: String,
     /// Demonstrations to learn from [default: 200 on the highway, 100 elsewhere; your own recordings: all]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=10_000_000))]
@@ -99,43 +41,9 @@ pub struct FitArgs {
     #[arg(long = "env-option", value_name = "KEY=VALUE")]
     pub env_options: Vec<String>,
 
-    /// Discount
-    #[arg(long, default_value_t = 0.9, value_name = "GAMMA", help_heading = "Learning")]
-    pub discount: f64,
-    /// Prior over the number of steps
-    #[arg(long, value_enum, default_value = "geometric", value_name = "PRIOR", help_heading = "Learning")]
-    pub horizon_prior: HorizonPriorArg,
-    /// Basis of the reward [default: state-action on the highway, state elsewhere]
-    #[arg(long, value_enum, value_name = "BASIS", help_heading = "Learning")]
-    pub basis: Option<BasisArg>,
-    /// Reward step of em
-    #[arg(long, value_enum, default_value = "nnls", value_name = "STEP", help_heading = "Learning")]
-    pub m_step: MStepArg,
-    /// Responsibilities of em
-    #[arg(long, value_enum, default_value = "approximate", value_name = "KIND", help_heading = "Learning")]
-    pub responsibility: ResponsibilityArg,
-    /// Planner that turns the reward into a policy
-    #[arg(long, value_enum, default_value = "value-iteration", value_name = "PLANNER", help_heading = "Learning")]
-    pub planner: PlannerArg,
-    /// Basis function that em's nnls takes as the reference
-    #[arg(long, default_value_t = 0, value_name = "RANK", help_heading = "Learning")]
-    pub reference_basis: u32,
-    /// Penalty on the weights of em-tied
-    #[arg(long, value_enum, default_value = "l1", value_name = "PENALTY", help_heading = "Learning")]
-    pub penalty: PenaltyArg,
-    /// Strength of the penalty [default: the method's own]
-    #[arg(long, value_name = "STRENGTH", help_heading = "Learning")]
-    pub penalty_strength: Option<f64>,
-    /// Pseudo-count of bc on every action
-    #[arg(long, default_value_t = 0.0, value_name = "COUNT", help_heading = "Learning")]
-    pub smoothing: f64,
-    /// Change of the objective below which the fit has converged
-    #[arg(long, default_value_t = 1e-6, value_name = "CHANGE", help_heading = "Learning")]
-    pub tolerance: f64,
-    /// Iterations after which the fit stops all the same
-    #[arg(long, default_value_t = 1000, value_name = "N", help_heading = "Learning",
-          value_parser = clap::value_parser!(u32).range(1..))]
-    pub max_iterations: u32,
+    /// How to learn
+    #[command(flatten)]
+    pub learning: LearningArgs,
 
     /// Seed of demonstrations, roll-outs and the method
     #[arg(long, default_value_t = 0, value_name = "SEED")]

@@ -1,9 +1,8 @@
 //! From flags to a job, checked without I/O: whatever can be refused before a server is asked is refused here.
 
-use super::args::{BasisArg, FitArgs, HorizonPriorArg, MStepArg, PenaltyArg, PlannerArg, ResponsibilityArg};
+use super::{args::FitArgs, learning};
 use crate::cli::error::CliError;
 use mazeway_client::Options;
-use mazeway_learner::irl;
 use mazeway_proto::learner::{self as pb, FitOptions};
 
 /// Which recordings a fit learns from.
@@ -69,31 +68,8 @@ impl Job {
     /// # Errors
     /// An unknown method, numbers out of range, malformed options: all usage errors.
     pub fn new(args: &FitArgs) -> Result<Self, CliError> {
-        let method = irl::METHODS.iter().find(|method| method.id() == args.method).ok_or_else(|| {
-            let known: Vec<_> = irl::METHODS.iter().map(|method| method.id()).collect();
-            CliError::usage(
-                format!("unknown method '{}' for --method", args.method),
-                format!("choose one of {}", known.join(", ")),
-            )
-        })?;
-        if !(args.discount >= 0.0 && args.discount < 1.0) {
-            return Err(CliError::usage(
-                format!("expected --discount in [0, 1), got {}", args.discount),
-                "a discount close to 1, such as 0.99, looks far ahead",
-            ));
-        }
-        for (flag, value) in [
-            ("--penalty-strength", args.penalty_strength.unwrap_or(0.0)),
-            ("--smoothing", args.smoothing),
-            ("--tolerance", args.tolerance),
-        ] {
-            if !value.is_finite() || value < 0.0 {
-                return Err(CliError::usage(
-                    format!("expected {flag} to be a number of at least 0, got {value}"),
-                    "leave it out for the default: learner fit --help",
-                ));
-            }
-        }
+        let method = learning::method(&args.method, "--method")?;
+        args.learning.check()?;
         Ok(Self {
             env_id: args.env.clone(),
             env_options: args.env_options.iter().map(|text| env_option(text)).collect::<Result<_, _>>()?,
@@ -108,11 +84,8 @@ impl Job {
                 Some(name) => Source::Named(name.to_owned()),
             },
             demonstrate: !args.no_demonstrate,
-            options: fit_options(args),
-            basis: args.basis.map(|basis| match basis {
-                BasisArg::State => pb::Basis::State,
-                BasisArg::StateAction => pb::Basis::StateAction,
-            }),
+            options: FitOptions { horizon: args.horizon, ..args.learning.options(u64::from(args.seed)) },
+            basis: args.learning.basis(),
             seed: args.seed,
             rollouts: args.rollouts,
         })
@@ -120,7 +93,7 @@ impl Job {
 }
 
 /// Parses `key=value`; a value that is not JSON is a string.
-fn env_option(text: &str) -> Result<(String, serde_json::Value), CliError> {
+pub fn env_option(text: &str) -> Result<(String, serde_json::Value), CliError> {
     let (key, value) = text.split_once('=').filter(|(key, _)| !key.is_empty()).ok_or_else(|| {
         CliError::usage(
             format!("expected KEY=VALUE for --env-option, got '{text}'"),
@@ -129,48 +102,6 @@ fn env_option(text: &str) -> Result<(String, serde_json::Value), CliError> {
     })?;
     let value = serde_json::from_str(value).unwrap_or_else(|_| serde_json::Value::String(value.to_owned()));
     Ok((key.to_owned(), value))
-}
-
-fn fit_options(args: &FitArgs) -> FitOptions {
-    FitOptions {
-        discount: Some(args.discount),
-        horizon: args.horizon,
-        horizon_prior: match args.horizon_prior {
-            HorizonPriorArg::Geometric => pb::HorizonPrior::Geometric,
-            HorizonPriorArg::Uniform => pb::HorizonPrior::Uniform,
-        }
-        .into(),
-        basis: pb::Basis::Unspecified.into(),
-        m_step: match args.m_step {
-            MStepArg::Nnls => pb::MStep::Nnls,
-            MStepArg::Simplex => pb::MStep::Simplex,
-        }
-        .into(),
-        responsibility: match args.responsibility {
-            ResponsibilityArg::Approximate => pb::Responsibility::Approximate,
-            ResponsibilityArg::Exact => pb::Responsibility::Exact,
-        }
-        .into(),
-        planner: match args.planner {
-            PlannerArg::ValueIteration => pb::Planner::ValueIteration,
-            PlannerArg::PolicyIteration => pb::Planner::PolicyIteration,
-            PlannerArg::SoftValueIteration => pb::Planner::SoftValueIteration,
-            PlannerArg::ExpectationMaximization => pb::Planner::ExpectationMaximization,
-        }
-        .into(),
-        reference_basis: Some(args.reference_basis),
-        penalty: match args.penalty {
-            PenaltyArg::L1 => pb::Penalty::L1,
-            PenaltyArg::L2 => pb::Penalty::L2,
-            PenaltyArg::None => pb::Penalty::None,
-        }
-        .into(),
-        penalty_strength: args.penalty_strength,
-        tolerance: Some(args.tolerance),
-        max_iterations: Some(args.max_iterations),
-        smoothing: Some(args.smoothing),
-        seed: Some(u64::from(args.seed)),
-    }
 }
 
 #[cfg(test)]

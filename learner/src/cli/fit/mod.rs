@@ -4,24 +4,21 @@
 //! client. What a person reads goes to standard output a line a step; see [`narrate`].
 
 mod args;
-mod assemble;
+pub mod assemble;
 mod evaluate;
-mod job;
-mod narrate;
-mod recordings;
+pub mod job;
+pub mod learning;
+pub mod narrate;
+pub mod recordings;
 mod services;
 
 pub use args::FitArgs;
 
-use super::error::CliError;
-use assemble::Truth;
+use super::{error::CliError, scene};
 use evaluate::Policies;
 use job::Job;
 use mazeway_client::Model;
-use mazeway_learner::{
-    mdp::{PlanOptions, PlannerKind, TabularMdp, plan},
-    report::{self, json, table::Terminal, write},
-};
+use mazeway_learner::report::{self, json, table::Terminal, write};
 use mazeway_proto::learner::FitRequest;
 use narrate::Narrator;
 use recordings::{Expert, Recordings};
@@ -67,8 +64,8 @@ async fn fit(args: &FitArgs, job: &Job, services: &Services, narrator: Narrator)
     spinner.finish_and_clear();
     narrator.step("model", describe(&model))?;
 
-    let mdp = checked(&model)?;
-    let truth = truth(job, &style, &model, &mdp)?;
+    let mdp = scene::checked(&model)?;
+    let truth = scene::truth(job.discount(), &style, &model, &mdp)?;
     let expert = match &truth {
         Some(truth) => Some(Expert::optimal(truth.optimal_policy.clone(), job.discount())),
         None => spec.drivers.iter().any(|(name, _)| *name == style && name != "random").then(|| Expert::driver(&style)),
@@ -146,34 +143,8 @@ async fn learn(
     Ok(fit)
 }
 
-/// The true reward and the optimal policy under it, where the model is exact and carries the style's reward.
-fn truth(job: &Job, style: &str, model: &Model, mdp: &TabularMdp) -> Result<Option<Truth>, CliError> {
-    let Some(reward) = model.reward(style).filter(|_| !model.estimated) else { return Ok(None) };
-    let options = PlanOptions { discount: job.discount(), ..PlanOptions::default() };
-    let optimal = plan(PlannerKind::PolicyIteration, mdp, reward, &options).map_err(|error| {
-        CliError::failure(format!("cannot plan under the true reward: {error}"), "try another --discount")
-    })?;
-    Ok(Some(Truth { reward: reward.to_vec(), optimal_policy: optimal.greedy_policy().into_probabilities() }))
-}
-
-fn checked(model: &Model) -> Result<TabularMdp, CliError> {
-    TabularMdp::new(
-        model.n_states as usize,
-        model.n_actions as usize,
-        model.row_offsets.clone(),
-        model.next_states.clone(),
-        model.probabilities.clone(),
-        Some(model.initial_distribution.clone()),
-    )
-    .map_err(|error| {
-        CliError::failure(
-            format!("the server's model is not one: {error}"),
-            "check the server's version with 'server --version'",
-        )
-    })
-}
-
-fn describe(model: &Model) -> String {
+/// A model in a line.
+pub fn describe(model: &Model) -> String {
     let visits: u64 = model.visit_counts.iter().flatten().sum();
     let origin = if model.estimated { format!("estimated from {visits} simulated steps") } else { "exact".to_owned() };
     format!(
@@ -208,7 +179,7 @@ fn cannot_write(message: String) -> CliError {
 }
 
 /// A directory's name from names that may hold anything.
-fn directory_name(names: &[&str]) -> String {
+pub fn directory_name(names: &[&str]) -> String {
     let safe = |name: &str| -> String {
         name.chars().map(|c| if c.is_alphanumeric() || "-_.".contains(c) { c } else { '_' }).collect()
     };

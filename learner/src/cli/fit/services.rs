@@ -6,6 +6,7 @@ use crate::cli::{
     data_directory,
     embedded::{self, Embedded},
     error::CliError,
+    scene,
 };
 use mazeway_client::{Connection, Env, EnvSpec, Episodes, Learner, Model, Rollout, SessionOptions};
 use mazeway_learner::report::Source;
@@ -94,15 +95,7 @@ impl Services {
     /// # Errors
     /// There is none of that name.
     pub async fn spec(&self, env_id: &str) -> Result<EnvSpec, CliError> {
-        let mut specs = self.environments.list_environments().await?;
-        if let Some(rank) = specs.iter().position(|spec| spec.env_id == env_id) {
-            return Ok(specs.swap_remove(rank));
-        }
-        let known: Vec<_> = specs.iter().map(|spec| spec.env_id.as_str()).collect();
-        Err(CliError::usage(
-            format!("unknown environment '{env_id}' for --env"),
-            format!("choose one of {}", known.join(", ")),
-        ))
+        scene::spec(&self.environments, env_id).await
     }
 
     /// The environment's tabular model.
@@ -110,17 +103,7 @@ impl Services {
     /// # Errors
     /// Wrong options; the server fails.
     pub async fn model(&self, job: &Job, spec: &EnvSpec) -> Result<Model, CliError> {
-        self.environments.model(&job.env_id, &job.env_options).await.map_err(|error| {
-            if !error.field().is_some_and(|field| field.starts_with("options")) {
-                return error.into();
-            }
-            let known: Vec<_> =
-                spec.options.iter().map(|option| format!("{}={}", option.name, option.default)).collect();
-            CliError::usage(
-                format!("wrong --env-option: {error}"),
-                format!("{} takes, with their defaults: {}", spec.env_id, known.join(", ")),
-            )
-        })
+        scene::model(&self.environments, spec, &job.env_options).await
     }
 
     /// Keeps a model in the learner.

@@ -3,6 +3,7 @@
 //! A picture is a white card 400 units wide, which a phone shows whole, or a sheet of several. Colours mean the same on
 //! all of them: darker is more, hatched was not visited by the demonstrations, tinted differs from what is known to be right.
 
+mod bands;
 mod canvas;
 mod colour;
 mod finite;
@@ -13,6 +14,7 @@ mod raster;
 mod trace;
 
 use super::{Report, ReportError};
+pub use bands::comparison;
 pub use raster::png;
 
 /// What a picture tells of.

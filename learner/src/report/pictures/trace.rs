@@ -70,10 +70,10 @@ fn range(points: &[(f64, f64)]) -> (f64, f64) {
 }
 
 /// What an axis spans.
-struct Axis {
-    low: f64,
-    high: f64,
-    logarithmic: bool,
+pub(super) struct Axis {
+    pub(super) low: f64,
+    pub(super) high: f64,
+    pub(super) logarithmic: bool,
 }
 
 impl Axis {
@@ -88,14 +88,14 @@ impl Axis {
     }
 
     /// Where a value lies between the ends, in [0, 1].
-    fn share(&self, value: f64) -> f64 {
+    pub(super) fn share(&self, value: f64) -> f64 {
         let scaled = |x: f64| if self.logarithmic { x.max(f64::MIN_POSITIVE).log10() } else { x };
         let (low, high) = (scaled(self.low), scaled(self.high));
         ((scaled(value) - low) / (high - low)).clamp(0.0, 1.0)
     }
 
     /// Powers of ten, or steps of 1, 2 or 5 times one; about `most` of them.
-    fn ticks(&self, most: u32) -> Vec<f64> {
+    pub(super) fn ticks(&self, most: u32) -> Vec<f64> {
         if self.logarithmic {
             let (low, high) = (self.low.log10().ceil() as i32, self.high.log10().floor() as i32);
             let step = (high - low) / most as i32 + 1;
@@ -110,7 +110,7 @@ impl Axis {
 }
 
 /// Label of a tick: powers of ten are written so.
-fn tick(value: f64) -> String {
+pub(super) fn tick(value: f64) -> String {
     let power = value.log10().round();
     if value > 0.0 && (value / 10f64.powf(power) - 1.0).abs() < 1e-9 && !(-2.0..4.0).contains(&power) {
         return format!("1e{power}").replace('-', "−");

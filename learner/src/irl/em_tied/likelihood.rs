@@ -51,6 +51,9 @@ pub struct Likelihood<'a> {
     /// γ Σ_{s,a} N(s,a) P(·|s,a) − N(·): the derivative of ℓ with respect to V.
     value_weights: Vec<f64>,
     solver: SoftSolver<'a>,
+    /// The v of the last gradient, from which the next one is solved.
+    adjoint: Vec<f64>,
+    residual: f64,
 }
 
 impl<'a> Likelihood<'a> {
@@ -63,7 +66,8 @@ impl<'a> Likelihood<'a> {
         for (weight, row) in value_weights.iter_mut().zip(counts.chunks_exact(mdp.n_actions())) {
             *weight -= row.iter().sum::<f64>();
         }
-        Self { mdp, basis, discount, counts, value_weights, solver: SoftSolver::new(mdp, discount) }
+        let solver = SoftSolver::new(mdp, discount);
+        Self { mdp, basis, discount, counts, value_weights, solver, adjoint: vec![0.0; mdp.n_states()], residual: 0.0 }
     }
 
     /// ℓ(w) and dℓ/dw, shape (`n_basis`,).
@@ -75,16 +79,19 @@ impl<'a> Likelihood<'a> {
         let q = self.solver.action_values().chunks_exact(n_actions);
         let log_likelihood = q
             .zip(self.counts.chunks_exact(n_actions))
+            .filter(|(_, n)| n.iter().any(|n| *n > 0.0))
             .map(|(q, n)| {
                 let value = log_sum_exp(q);
                 q.iter().zip(n).map(|(q, n)| if *n > 0.0 { n * (q - value) } else { 0.0 }).sum::<f64>()
             })
             .sum();
-        let policy = self.solver.policy();
-        let v = Resolvent::new(self.mdp, policy, self.discount).solve_transposed(&self.value_weights);
+        (self.adjoint, self.residual) = self.solver.solve_transposed(&self.value_weights, Some(&self.adjoint));
         let mut by_reward = self.counts.clone();
-        for (pair, (g, p)) in by_reward.iter_mut().zip(policy).enumerate() {
-            *g += p * v[pair / n_actions];
+        let rows = by_reward.chunks_exact_mut(n_actions).zip(self.solver.policy().chunks_exact(n_actions));
+        for ((row, pi), v) in rows.zip(&self.adjoint) {
+            for (g, p) in row.iter_mut().zip(pi) {
+                *g += p * v;
+            }
         }
         (log_likelihood, self.basis.project(&by_reward))
     }
@@ -128,6 +135,12 @@ impl<'a> Likelihood<'a> {
             hessian.gemm(1.0, &weighted, &centred.transpose(), 1.0);
         }
         (hessian, terms)
+    }
+
+    /// Relative residual ‖b − Mᵀv‖ / ‖b‖ of the last gradient's linear system; that of its soft values is
+    /// [`SoftSolver::residual`].
+    pub fn residual(&self) -> f64 {
+        self.residual
     }
 
     /// Soft values and policy of the weights last evaluated.

@@ -20,9 +20,10 @@ pub(super) fn improve(mdp: &TabularMdp, reward: &[f64], discount: f64, action_va
     let n_actions = mdp.n_actions();
     let mut chosen: Vec<usize> = action_values.chunks_exact(n_actions).map(first_best).collect();
     let mut iterations = before;
+    let mut resolvent = Resolvent::of_model(mdp, discount);
     loop {
         iterations += 1;
-        let state_values = evaluate(mdp, reward, discount, &chosen);
+        let state_values = evaluate(&mut resolvent, mdp, reward, &chosen);
         let action_values = mdp.action_values(reward, discount, &state_values);
         // well below what counts as a tie and above the rounding of the solve
         let margin = 1e-3 * TIE_TOLERANCE * max_abs(&action_values);
@@ -41,14 +42,15 @@ pub(super) fn improve(mdp: &TabularMdp, reward: &[f64], discount: f64, action_va
     }
 }
 
-fn evaluate(mdp: &TabularMdp, reward: &[f64], discount: f64, chosen: &[usize]) -> Vec<f64> {
+fn evaluate(resolvent: &mut Resolvent, mdp: &TabularMdp, reward: &[f64], chosen: &[usize]) -> Vec<f64> {
     let mut policy = vec![0.0; mdp.n_pairs()];
     let mut received = vec![0.0; mdp.n_states()];
     for (state, &action) in chosen.iter().enumerate() {
         policy[mdp.pair(state, action)] = 1.0;
         received[state] = reward[mdp.pair(state, action)];
     }
-    Resolvent::new(mdp, &policy, discount).solve(&received)
+    resolvent.set_policy(mdp, &policy);
+    resolvent.solve(&received)
 }
 
 fn first_best(values: &[f64]) -> usize {

@@ -5,7 +5,7 @@
 //! dynamic discrete choice in the same way). A [`SoftSolver`] keeps its last values as the start of the next solution.
 
 use crate::mdp::linear::Resolvent;
-use crate::mdp::numeric::{log_sum_exp, max_abs};
+use crate::mdp::numeric::{max, max_abs, norm};
 use crate::mdp::plan::Plan;
 use crate::mdp::{Policy, TabularMdp};
 
@@ -13,6 +13,8 @@ const MAX_STEPS: u32 = 200;
 /// Wanted |V − log Σ exp Q|, relative to the largest value.
 /// Little above rounding: the error of the values is up to 1/(1 − γ) times this.
 const RELATIVE_TOLERANCE: f64 = 2e-15;
+/// What rounding of the exponentials may leave of it.
+const ROUNDING: f64 = 1e-13;
 
 /// Solves for soft values again and again as the reward moves.
 pub struct SoftSolver<'a> {
@@ -21,6 +23,9 @@ pub struct SoftSolver<'a> {
     state_values: Vec<f64>,
     action_values: Vec<f64>,
     policy: Vec<f64>,
+    errors: Vec<f64>,
+    resolvent: Resolvent,
+    residual: f64,
     iterations: u32,
     converged: bool,
 }
@@ -38,6 +43,9 @@ impl<'a> SoftSolver<'a> {
             state_values: vec![0.0; mdp.n_states()],
             action_values: vec![0.0; mdp.n_pairs()],
             policy: vec![0.0; mdp.n_pairs()],
+            errors: vec![0.0; mdp.n_states()],
+            resolvent: Resolvent::of_model(mdp, discount),
+            residual: f64::INFINITY,
             iterations: 0,
             converged: false,
         }
@@ -45,39 +53,66 @@ impl<'a> SoftSolver<'a> {
 
     /// Solves for R(s,a), shape (`n_states * n_actions`,), from the last solution on.
     pub fn solve(&mut self, reward: &[f64]) {
-        let n_actions = self.mdp.n_actions();
-        let mut residual = vec![0.0; self.mdp.n_states()];
         let mut last = f64::INFINITY;
+        // what Newton's step is bound to have left of the error, relative to the scale
+        let mut promised = f64::INFINITY;
         self.iterations = 0;
         self.converged = false;
         loop {
-            self.mdp.action_values_into(reward, self.discount, &self.state_values, &mut self.action_values);
-            let rows = self.action_values.chunks_exact(n_actions).zip(self.policy.chunks_exact_mut(n_actions));
-            for ((q, pi), (r, v)) in rows.zip(residual.iter_mut().zip(&self.state_values)) {
-                let value = log_sum_exp(q);
-                *r = value - v;
-                for (p, q) in pi.iter_mut().zip(q) {
-                    *p = (q - value).exp();
-                }
-            }
-            let size = max_abs(&residual);
+            self.sweep(reward);
+            let size = max_abs(&self.errors);
             let scale = 1.0 + max_abs(&self.state_values);
-            if size <= RELATIVE_TOLERANCE * scale || (size <= 1e-9 * scale && size >= 0.5 * last) {
+            self.residual = size;
+            let at_rounding = size <= ROUNDING * scale && promised <= RELATIVE_TOLERANCE;
+            if at_rounding || size <= RELATIVE_TOLERANCE * scale || (size <= 1e-9 * scale && size >= 0.5 * last) {
                 self.converged = true;
                 break;
             }
-            if self.iterations == MAX_STEPS {
+            if self.iterations == MAX_STEPS || !size.is_finite() {
                 break;
             }
             last = size;
             self.iterations += 1;
+            self.resolvent.set_policy(self.mdp, &self.policy);
             // far from the solution Newton's step is itself rough: its error is corrected by the next
             let rough = (1e-3 * size / scale).clamp(1e-8, 1e-4);
-            let step = Resolvent::new(self.mdp, &self.policy, self.discount).solve_roughly(&residual, rough);
-            for (v, d) in self.state_values.iter_mut().zip(step) {
+            let step = self.resolvent.solve_roughly(&self.errors, rough);
+            for (v, d) in self.state_values.iter_mut().zip(&step.x) {
                 *v += d;
             }
+            // the second derivative of log Σ exp is a variance, at most a quarter of the squared range
+            let reach = 2.0 * self.discount * max_abs(&step.x);
+            let unsolved = step.residual * norm(&self.errors);
+            promised = (0.125 * reach * reach + unsolved) / scale;
         }
+    }
+
+    /// Q, π and the errors log Σ exp Q − V of the present V.
+    fn sweep(&mut self, reward: &[f64]) {
+        let n_actions = self.mdp.n_actions();
+        self.mdp.action_values_into(reward, self.discount, &self.state_values, &mut self.action_values);
+        let rows = self.action_values.chunks_exact(n_actions).zip(self.policy.chunks_exact_mut(n_actions));
+        for ((q, pi), (error, v)) in rows.zip(self.errors.iter_mut().zip(&self.state_values)) {
+            let largest = max(q);
+            let mut sum = 0.0;
+            for (p, q) in pi.iter_mut().zip(q) {
+                *p = (q - largest).exp();
+                sum += *p;
+            }
+            let share = 1.0 / sum;
+            for p in pi {
+                *p *= share;
+            }
+            *error = largest + sum.ln() - v;
+        }
+    }
+
+    /// x of (I − γP_π)ᵀ x = b for the policy of the last solution, shape (`n_states`,), and ‖b − (I − γP_π)ᵀ x‖ / ‖b‖.
+    /// `start` may be the solution of a similar system.
+    pub(crate) fn solve_transposed(&mut self, b: &[f64], start: Option<&[f64]>) -> (Vec<f64>, f64) {
+        self.resolvent.set_policy(self.mdp, &self.policy);
+        let solution = self.resolvent.solve_transposed_from(b, start);
+        (solution.x, solution.residual)
     }
 
     /// V(s), shape (`n_states`,).
@@ -93,6 +128,11 @@ impl<'a> SoftSolver<'a> {
     /// π(a|s) = exp(Q − V), shape (`n_states * n_actions`,).
     pub fn policy(&self) -> &[f64] {
         &self.policy
+    }
+
+    /// max |V − log Σ exp Q| of the last solution; V itself is at most 1/(1 − γ) times this away from the exact one.
+    pub fn residual(&self) -> f64 {
+        self.residual
     }
 
     /// True where the last solution satisfies its equation.

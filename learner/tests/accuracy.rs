@@ -40,7 +40,8 @@ fn em_tied_is_the_most_accurate() {
     let maze = maze();
     for (trajectories, tied_at_least, em_at_least) in [(5, 0.78, 0.55), (20, 0.95, 0.78), (100, 0.99, 0.80)] {
         let [tied, em, bc] = ["em-tied", "em", "bc"].map(|method| mean_agreement(&maze, method, trajectories));
-        println!("L = {trajectories}: em-tied {tied:.3}, em {em:.3}, bc {bc:.3}");
+        let mixture = mean_agreement(&maze, "em-mixture", trajectories);
+        println!("L = {trajectories}: em-tied {tied:.3}, em {em:.3}, em-mixture {mixture:.3}, bc {bc:.3}");
         assert!(tied >= tied_at_least, "em-tied at L = {trajectories}: {tied}");
         assert!(em >= em_at_least, "em at L = {trajectories}: {em}");
         assert!(tied > bc, "em-tied {tied} must beat bc {bc} at L = {trajectories}");

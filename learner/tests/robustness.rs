@@ -24,7 +24,9 @@ fn pick<T: Copy>(from: &[T], random: &mut Pcg64) -> T {
 
 fn normalised(mut weights: Vec<f64>) -> Vec<f64> {
     let sum: f64 = weights.iter().sum();
-    weights.iter_mut().for_each(|w| *w /= sum);
+    for w in &mut weights {
+        *w /= sum;
+    }
     weights
 }
 
@@ -103,7 +105,7 @@ fn any_demonstrations(mdp: &TabularMdp, random: &mut Pcg64) -> Demonstrations {
 fn any_features(mdp: &TabularMdp, random: &mut Pcg64) -> Features {
     let on_pairs = below(2, random) == 0;
     let rows = if on_pairs { mdp.n_pairs() } else { mdp.n_states() };
-    let columns: Vec<Vec<f64>> = (0..1 + below(4, random))
+    let columns: Vec<Vec<f64>> = (0..=below(4, random))
         .map(|_| match below(5, random) {
             0 => vec![1.0; rows],
             1 => vec![0.0; rows],

@@ -268,6 +268,18 @@ def record_lake(address, style, **arguments):
     return mazeway.Recorder(env, style=style, address=address, **arguments)
 
 
+def test_states_alone(style):
+    alone = trajectory(style, actions=None)
+    without_end = trajectory(style, actions=None, final_state=None)
+    assert (len(alone), len(without_end)) == (4, 3)
+    for sent in (alone, without_end):
+        read = Trajectory.from_wire(sent.to_wire())
+        assert read.actions is None
+        assert (read.states.tolist(), read.final_state) == (sent.states.tolist(), sent.final_state)
+    with pytest.raises(mazeway.InvalidArgumentError, match="at least two"):
+        trajectory(style, steps=1, actions=None, final_state=None)
+
+
 def test_recorder_stores_before_the_next_reset(learner, learner_address, style):
     env = record_lake(learner_address, style)
     env.reset(seed=1)

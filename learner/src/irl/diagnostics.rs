@@ -289,7 +289,7 @@ mod tests {
     fn plain_rhat_by_hand() {
         // variances 5/3 and 5/3, means 2.5 and 4.5: W = 5/3, B/N = 2, N = 4
         let chains = [vec![1.0, 2.0, 3.0, 4.0], vec![3.0, 4.0, 5.0, 6.0]];
-        let want = (0.75 + 2.0 / (5.0 / 3.0) as f64).sqrt();
+        let want = (0.75_f64 + 2.0 / (5.0 / 3.0)).sqrt();
         assert!((plain_rhat(&chains) - want).abs() < 1e-12);
         // ranks 1, 2, 3.5, 5.5, 3.5, 5.5, 7, 8 of 8
         let ranked = rank_normalised(&chains);

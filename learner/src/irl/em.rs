@@ -7,6 +7,7 @@
 //! The objective is the part of Q that depends on the reward, cᵀw − ½ wᵀC w. C is diagonal for the Dirac bases; for a user's
 //! features it is full, see [`em_features`].
 
+use super::stationary::Stationarity;
 use super::{
     BasisKind, Fit, FitError, MStep, Method, Problem, Progress, Responsibility, Stopped, Trace, em_features, nnls,
     simplex,
@@ -109,6 +110,29 @@ fn quality(weights: &[f64], linear: &[f64], curvature: &[f64]) -> f64 {
 /// Functions that were never demonstrated have the same column and the same row, so they are taken as one unknown and one
 /// row (with the weight of all) and share its value evenly: the least-norm solution, and the same for any order of states.
 fn stationary(linear: &[f64], curvature: &[f64], reference: usize) -> Result<Vec<f64>, FitError> {
+    let others: Vec<usize> = (0..curvature.len()).filter(|&i| curvature[i] > 0.0 && i != reference).collect();
+    let of_others = |values: &[f64]| others.iter().map(|&i| values[i]).collect::<Vec<_>>();
+    let reference_shown = curvature[reference] > 0.0;
+    let hidden = curvature.len() - others.len() - usize::from(reference_shown);
+    let problem = Stationarity {
+        linear: &of_others(linear),
+        curvature: &of_others(curvature),
+        reference: reference_shown.then(|| (linear[reference], curvature[reference])),
+        hidden,
+    };
+    let Some(found) = problem.minimise() else { return by_exchanges(linear, curvature, reference) };
+    let mut weights = vec![found.hidden / hidden.max(1) as f64; curvature.len()];
+    for (&i, &w) in others.iter().zip(&found.shown) {
+        weights[i] = w;
+    }
+    if reference_shown {
+        weights[reference] = found.reference;
+    }
+    Ok(weights)
+}
+
+/// [`stationary`] by exchanges on the dense matrix (Lawson & Hanson), where its active sets cycle.
+fn by_exchanges(linear: &[f64], curvature: &[f64], reference: usize) -> Result<Vec<f64>, FitError> {
     let shown: Vec<usize> = (0..curvature.len()).filter(|&i| curvature[i] > 0.0).collect();
     if shown.len() > MAX_DEMONSTRATED {
         let (limit, got) = (MAX_DEMONSTRATED, shown.len());

@@ -19,6 +19,7 @@ pub mod nnls;
 mod options;
 mod random;
 mod simplex;
+mod stationary;
 mod temperature;
 
 pub use crate::mdp::{HorizonPrior, PlannerKind};

@@ -1,7 +1,8 @@
 //! The Boltzmann policy that explains demonstrations best.
 //!
 //! A hard planner gives action values and no probabilities. π(a|s) ∝ exp(β Q(s,a)) makes them a policy; β ≥ 0 is the
-//! maximum-likelihood one. The log-likelihood is concave in β, so bisection on its derivative finds the maximum.
+//! maximum-likelihood one. The log-likelihood is concave in β, so Newton's method on its derivative, kept
+//! within a bracket by bisection, finds the maximum.
 
 use crate::mdp::Policy;
 
@@ -23,43 +24,61 @@ pub(super) fn most_likely_boltzmann(n_actions: usize, action_values: &[f64], cou
     if spread <= 1e-12 * magnitude || spread == 0.0 {
         return (Policy::boltzmann(n_actions, action_values, 0.0), 0.0);
     }
+    // the derivative of the log-likelihood, how fast it falls, and the size of what it is the difference of
     let slope = |beta: f64| {
-        let mut slope = 0.0;
+        let (mut slope, mut fall, mut size) = (0.0, 0.0, 0.0);
         for (q, n) in action_values.chunks_exact(n_actions).zip(counts.chunks_exact(n_actions)) {
             let visits: f64 = n.iter().sum();
             if visits > 0.0 {
                 let largest = q.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-                let (mut mass, mut mean, mut seen) = (0.0, 0.0, 0.0);
+                let (mut mass, mut mean, mut square, mut seen) = (0.0, 0.0, 0.0, 0.0);
                 for (&q, &n) in q.iter().zip(n) {
-                    let weight = (beta * (q - largest)).exp();
+                    let gap = q - largest;
+                    let weight = if gap == 0.0 { 1.0 } else { (beta * gap).exp() };
                     mass += weight;
-                    mean += weight * (q - largest);
-                    seen += n * (q - largest);
+                    mean += weight * gap;
+                    square += weight * gap * gap;
+                    seen += n * gap;
                 }
-                slope += seen - visits * mean / mass;
+                mean /= mass;
+                slope += seen - visits * mean;
+                size -= seen + visits * mean;
+                fall += visits * (square / mass - mean * mean);
             }
         }
-        slope
+        (slope, fall, size)
     };
     let (mut low, mut high) = (0.0, LARGEST / spread);
-    if slope(low) <= 0.0 {
+    let (mut beta, mut at) = (low, slope(low));
+    if at.0 <= 0.0 {
         return (Policy::boltzmann(n_actions, action_values, 0.0), 0.0);
     }
-    if slope(high) >= 0.0 {
+    if slope(high).0 >= 0.0 {
         return (Policy::boltzmann(n_actions, action_values, high), high);
     }
+    let mut last = f64::INFINITY;
     for _ in 0..200 {
-        let middle = 0.5 * (low + high);
-        if middle <= low || middle >= high {
+        let newton = beta + at.0 / at.1;
+        // where steps gain too little, as from far up the flat end, halve the bracket: its ends lie decades apart
+        let trusted = newton > low && newton < high && at.0.abs() <= 0.9 * last;
+        let middle = if low > 1e-3 * high { 0.5 * (low + high) } else { (low.max(1e-9 * high) * high).sqrt() };
+        let next = if trusted { newton } else { middle };
+        if next == beta || next <= low || next >= high {
             break;
         }
-        if slope(middle) > 0.0 {
-            low = middle;
+        let step = (next - beta).abs();
+        (last, beta) = (if trusted { at.0.abs() } else { f64::INFINITY }, next);
+        at = slope(beta);
+        if at.0 > 0.0 {
+            low = beta;
         } else {
-            high = middle;
+            high = beta;
+        }
+        if at.0.abs() <= 4.0 * f64::EPSILON * at.2 || (trusted && step <= 4.0 * f64::EPSILON * beta) {
+            break;
         }
     }
-    (Policy::boltzmann(n_actions, action_values, low), low)
+    (Policy::boltzmann(n_actions, action_values, beta), beta)
 }
 
 #[cfg(test)]

@@ -99,7 +99,7 @@ impl StatisticsBuilder {
 
     /// Counts a trajectory as it is stored: states and actions packed as little-endian 32-bit integers, without unpacking
     /// them first. Of arrays that differ in length, what goes beyond the shorter one does not count; without a step there is
-    /// no trajectory.
+    /// no trajectory. States alone go through [`StatisticsBuilder::add`].
     ///
     /// # Errors
     /// As [`StatisticsBuilder::add`].

@@ -114,7 +114,7 @@ fn any_features(mdp: &TabularMdp, random: &mut Pcg64) -> Features {
             _ => vector(rows, random),
         })
         .collect();
-    let unit = pick(&[1.0, 1.0, 1e-9, 1e9, -1.0], random);
+    let unit = pick(&[1.0, 1.0, 1e-9, 1e9, -1.0, 1e-100, 1e100], random);
     let table: Vec<f64> = (0..rows).flat_map(|row| columns.iter().map(move |column| unit * column[row])).collect();
     let names = (0..columns.len()).map(|f| format!("f{f}")).collect();
     if on_pairs {
@@ -221,11 +221,12 @@ fn called_for(error: &FitError, method: &dyn Method, options: &FitOptions) -> bo
     }
 }
 
-/// Fits with every method and says what is wrong.
-fn wrongs(seed: u64, problem: &Problem<'_>) -> Vec<String> {
+/// Fits with every method and says what is wrong; counts the fits of each.
+fn wrongs(seed: u64, problem: &Problem<'_>, fits: &mut [u32]) -> Vec<String> {
     let mut wrongs = Vec::new();
-    for method in METHODS {
+    for (method, fits) in METHODS.iter().zip(fits) {
         let outcome = catch_unwind(AssertUnwindSafe(|| run(*method, problem)));
+        *fits += u32::from(matches!(outcome, Ok(Ok(_))));
         let wrong = match outcome {
             Ok(Ok(found)) => flaw(&found, problem.mdp),
             Ok(Err(error)) if called_for(&error, *method, problem.options) => None,
@@ -244,7 +245,9 @@ fn assert_none(wrongs: &[String]) {
 #[test]
 fn every_method_fits_or_says_why_not() {
     let mut wrong = Vec::new();
-    for seed in 0..1500 {
+    let mut fits = vec![0; METHODS.len()];
+    let cases = 1500;
+    for seed in 0..cases {
         let mut random = generator(seed);
         let mdp = any_process(&mut random);
         let data = any_demonstrations(&mdp, &mut random);
@@ -260,14 +263,20 @@ fn every_method_fits_or_says_why_not() {
                 demonstrations: Some(&data),
                 features: Some(&features),
             },
+            &mut fits,
         ));
     }
     assert_none(&wrong);
+    for (method, &fits) in METHODS.iter().zip(&fits) {
+        println!("{}: {fits} fits of {cases}", method.id());
+        assert!(2 * u64::from(fits) > cases, "{} refused most cases: {fits} fits of {cases}", method.id());
+    }
 }
 
 #[test]
 fn states_alone_fit_or_say_why_not() {
     let mut wrong = Vec::new();
+    let mut fits = vec![0; METHODS.len()];
     for seed in 10_000..10_500 {
         let mut random = generator(seed);
         let mdp = any_process(&mut random);
@@ -291,6 +300,7 @@ fn states_alone_fit_or_say_why_not() {
                 demonstrations: Some(&data),
                 features: Some(&features),
             },
+            &mut fits,
         ));
     }
     assert_none(&wrong);

@@ -6,7 +6,7 @@
 
 use super::SoftLikelihood;
 use crate::irl::{Basis, FitError};
-use crate::mdp::{TabularMdp, log_sum_exp};
+use crate::mdp::{Policy, TabularMdp, log_sum_exp};
 use crate::statistics::Statistics;
 use nalgebra::DMatrix;
 
@@ -160,14 +160,10 @@ impl<'a> FiniteLikelihood<'a> {
 
     /// π with t steps to go.
     fn step_policy(&self, t: usize) -> Vec<f64> {
-        let (n_states, n_actions) = (self.mdp.n_states(), self.mdp.n_actions());
-        let mut policy = self.mdp.action_values(&self.reward, 1.0, &self.values[(t - 1) * n_states..][..n_states]);
-        for (row, v) in policy.chunks_exact_mut(n_actions).zip(&self.values[t * n_states..]) {
-            for p in row {
-                *p = (*p - v).exp();
-            }
-        }
-        policy
+        let n_states = self.mdp.n_states();
+        let values = self.mdp.action_values(&self.reward, 1.0, &self.values[(t - 1) * n_states..][..n_states]);
+        // normalised: of large values exp(Q − V) would keep few digits
+        Policy::boltzmann(self.mdp.n_actions(), &values, 1.0).into_probabilities()
     }
 
     /// The adjoint recursion from the first step to the last.

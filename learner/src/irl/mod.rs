@@ -5,8 +5,10 @@
 
 #![expect(clippy::doc_markdown, reason = "formulae in the notation of the papers are not code")]
 
+mod apprenticeship;
 mod basis;
 mod bc;
+mod bc_planning;
 mod birl;
 mod bounded;
 mod diagnostics;
@@ -15,12 +17,19 @@ mod em_features;
 mod em_mixture;
 pub mod em_tied;
 mod latent;
+mod lp;
+mod maxent;
+mod mce;
 pub mod nnls;
 mod options;
+mod penalty;
 mod random;
 mod simplex;
 mod stationary;
 mod temperature;
+#[cfg(test)]
+mod test_cases;
+mod visits;
 
 pub use crate::mdp::{HorizonPrior, PlannerKind};
 pub use basis::Basis;
@@ -77,7 +86,20 @@ pub trait Method: Sync {
 }
 
 /// All methods, the default first.
-pub const METHODS: &[&dyn Method] = &[&em_tied::EmTied, &em::Em, &em_mixture::EmMixture, &birl::Birl, &bc::Bc];
+pub const METHODS: &[&dyn Method] = &[
+    &em_tied::EmTied,
+    &em::Em,
+    &em_mixture::EmMixture,
+    &maxent::MaxEnt,
+    &mce::Mce,
+    &mce::MceLikelihood,
+    &apprenticeship::Projection,
+    &apprenticeship::MaxMargin,
+    &lp::Lp,
+    &birl::Birl,
+    &bc::Bc,
+    &bc_planning::BcPlanning,
+];
 
 /// The method of a name.
 pub fn method(id: &str) -> Option<&'static dyn Method> {

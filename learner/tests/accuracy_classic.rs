@@ -40,17 +40,17 @@ fn agreements(maze: &Maze, method: &str, trajectories: usize) -> (Vec<f64>, f64)
 /// Prints a method's row and asserts lower bounds: what was measured less about the half-width of its interval over seeds.
 fn at_least(method: &str, bounds: [f64; 5]) {
     let maze = layout("given", 0.3);
-    let mut row = format!("{method:15}");
+    let mut cells = vec![format!("{method:15}")];
     let mut misses = Vec::new();
     for (trajectories, bound) in TRAJECTORIES.into_iter().zip(bounds) {
         let (all, secs) = agreements(&maze, method, trajectories);
         let interval = mean_interval(&all).expect("samples");
-        row += &format!("  {:.3} ± {:.3} ({:.1} ms)", interval.mean, interval.high - interval.mean, 1e3 * secs);
+        cells.push(format!("{:.3} ± {:.3} ({:.1} ms)", interval.mean, interval.high - interval.mean, 1e3 * secs));
         if interval.mean < bound {
             misses.push(format!("L = {trajectories}: {:.3}, expected {bound}", interval.mean));
         }
     }
-    println!("{row}");
+    println!("{}", cells.join("  "));
     assert!(misses.is_empty(), "{method}: {misses:?}");
 }
 

@@ -33,7 +33,7 @@ pub(super) fn maximise(
         &settings,
         vec![0.0; basis.len()],
         |weights| {
-            let beyond = !(max_abs(&basis.reward(weights)) <= LARGEST_REWARD);
+            let beyond = max_abs(&basis.reward(weights)) > LARGEST_REWARD;
             limited |= beyond;
             if beyond {
                 return (f64::INFINITY, vec![0.0; weights.len()]);

@@ -16,6 +16,7 @@ mod em;
 mod em_features;
 mod em_mixture;
 pub mod em_tied;
+mod gpirl;
 mod latent;
 mod lp;
 mod maxent;
@@ -97,6 +98,7 @@ pub const METHODS: &[&dyn Method] = &[
     &apprenticeship::MaxMargin,
     &lp::Lp,
     &birl::Birl,
+    &gpirl::Gpirl,
     &bc::Bc,
     &bc_planning::BcPlanning,
 ];

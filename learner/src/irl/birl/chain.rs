@@ -5,7 +5,7 @@
 //! (Hoffman & Gelman 2014), the length of a trajectory is drawn anew for every draw. After the warm-up nothing adapts.
 //! Invariant: a chain depends on its seed and index alone.
 
-use super::optimum::axpy;
+use super::optimum::{axpy, multiply};
 use super::target::{Model, Point, Target, half_dot};
 use crate::irl::random::Stream;
 use nalgebra::{Cholesky, DMatrix};
@@ -43,6 +43,9 @@ impl<'a> Chain<'a> {
         let mut target = Target::new(model);
         let n = model.basis.len();
         let x: Vec<f64> = (0..n).map(|_| stream.normal()).collect();
+        if warm_up > 0 {
+            target.temper(1.0 / f64::from(warm_up / 4 + 1));
+        }
         let point = target.evaluate(&x);
         let mut chain = Self {
             target,
@@ -120,10 +123,15 @@ impl<'a> Chain<'a> {
         acceptance
     }
 
-    /// The warm-up's schedule: metrics of single points at first, then of the mean over points that look like the posterior.
+    /// The warm-up's schedule: the likelihood comes to its full power in the first quarter, lest a chain be caught where it
+    /// happened to begin (simulated tempering, downward only); metrics of single points at first, then of the mean over points that look like the posterior.
     fn adapt(&mut self, acceptance: f64) {
         self.step.update(acceptance);
         let (i, w) = (self.iteration, self.warm_up);
+        if i <= w / 4 {
+            self.target.temper(f64::from(i + 1) / f64::from(w / 4 + 1));
+            self.refresh_point();
+        }
         let collect_from = w / 4;
         let every = (w / 24).max(1);
         if i < collect_from {
@@ -255,10 +263,7 @@ impl Metric {
     fn velocity_into(&self, momentum: &[f64], velocity: &mut [f64]) {
         match &self.kind {
             Kind::Dense { inverse, .. } => {
-                velocity.fill(0.0);
-                for (column, &p) in inverse.as_slice().chunks_exact(momentum.len()).zip(momentum) {
-                    axpy(p, column, velocity);
-                }
+                multiply(inverse.as_slice(), momentum, velocity);
             }
             Kind::Diagonal { metric, .. } => {
                 for ((v, p), m) in velocity.iter_mut().zip(momentum).zip(metric) {

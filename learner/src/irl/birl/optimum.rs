@@ -31,6 +31,8 @@ pub(super) struct Optimum<'a> {
     state_values: Vec<f64>,
     action_values: Vec<f64>,
     column: Vec<f64>,
+    /// R_π.
+    received: Vec<f64>,
     /// K, where γ = 1.
     horizon: Option<u32>,
 }
@@ -50,6 +52,7 @@ impl<'a> Optimum<'a> {
             state_values: vec![0.0; n],
             action_values: vec![0.0; mdp.n_pairs()],
             column: vec![0.0; n],
+            received: vec![0.0; n],
             horizon,
         };
         if horizon.is_none() {
@@ -169,13 +172,10 @@ impl<'a> Optimum<'a> {
     /// V = X R_π and Q = R + γPV.
     fn evaluate(&mut self, reward: &[f64]) {
         let n_actions = self.mdp.n_actions();
-        self.state_values.fill(0.0);
-        for (state, column) in self.inverse.chunks_exact(self.mdp.n_states()).enumerate() {
-            let r = reward[state * n_actions + self.chosen[state] as usize];
-            if r != 0.0 {
-                axpy(r, column, &mut self.state_values);
-            }
+        for ((r, row), &action) in self.received.iter_mut().zip(reward.chunks_exact(n_actions)).zip(&self.chosen) {
+            *r = row[action as usize];
         }
+        multiply(&self.inverse, &self.received, &mut self.state_values);
         self.mdp.action_values_into(reward, self.discount, &self.state_values, &mut self.action_values);
     }
 
@@ -249,6 +249,24 @@ fn first_best(values: &[f64]) -> usize {
 pub(super) fn axpy(a: f64, x: &[f64], y: &mut [f64]) {
     for (y, x) in y.iter_mut().zip(x) {
         *y += a * x;
+    }
+}
+
+/// y = A x of a square A by columns, four at a time.
+pub(super) fn multiply(columns: &[f64], x: &[f64], y: &mut [f64]) {
+    let n = x.len();
+    y.fill(0.0);
+    let (fours, rest) = columns.split_at(n * (n - n % 4));
+    let (x4, x_rest) = x.split_at(n - n % 4);
+    for (block, x) in fours.chunks_exact(4 * n).zip(x4.chunks_exact(4)) {
+        let (a, b) = block.split_at(2 * n);
+        let ((a, b), (c, d)) = (a.split_at(n), b.split_at(n));
+        for ((((y, a), b), c), d) in y.iter_mut().zip(a).zip(b).zip(c).zip(d) {
+            *y += (x[0] * a + x[1] * b) + (x[2] * c + x[3] * d);
+        }
+    }
+    for (column, &x) in rest.chunks_exact(n).zip(x_rest) {
+        axpy(x, column, y);
     }
 }
 

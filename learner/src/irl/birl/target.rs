@@ -50,6 +50,8 @@ pub(super) struct Target<'a> {
     model: Model<'a>,
     optimum: Optimum<'a>,
     visits: Vec<f64>,
+    /// Power of the likelihood, 1 but for the beginning of the warm-up.
+    power: f64,
     /// dℓ/dQ.
     by_value: Vec<f64>,
 }
@@ -58,7 +60,13 @@ impl<'a> Target<'a> {
     pub(super) fn new(model: Model<'a>) -> Self {
         let visits = model.counts.chunks_exact(model.mdp.n_actions()).map(|n| n.iter().sum()).collect();
         let optimum = Optimum::new(model.mdp, model.discount, model.horizon);
-        Self { model, optimum, visits, by_value: vec![0.0; model.mdp.n_pairs()] }
+        Self { model, optimum, visits, power: 1.0, by_value: vec![0.0; model.mdp.n_pairs()] }
+    }
+
+    /// Takes the likelihood to a power in [0, 1].
+    pub(super) fn temper(&mut self, share: f64) {
+        // early steps matter more: a power of 0.1 still tells most of what a thousand steps say
+        self.power = if share >= 1.0 { 1.0 } else { share.max(0.0).powi(3) };
     }
 
     pub(super) fn evaluate(&mut self, x: &[f64]) -> Point {
@@ -108,9 +116,9 @@ impl<'a> Target<'a> {
             let log_mass = mass.ln();
             for ((p, &q), &n) in by_value.iter_mut().zip(q).zip(n) {
                 if n > 0.0 {
-                    log_likelihood += n * (beta * (q - largest) - log_mass);
+                    log_likelihood += self.power * n * (beta * (q - largest) - log_mass);
                 }
-                *p = beta * (n - visits * *p / mass);
+                *p = self.power * beta * (n - visits * *p / mass);
             }
         }
         log_likelihood
@@ -135,7 +143,7 @@ impl<'a> Target<'a> {
                     super::optimum::axpy(m / mass, sensitivity, &mut mean);
                 }
                 for (m, sensitivity) in masses.iter().zip(sensitivities) {
-                    let scale = beta * (self.visits[state] * m / mass).sqrt();
+                    let scale = beta * (self.power * self.visits[state] * m / mass).sqrt();
                     if scale > 0.0 {
                         for ((r, d), (s, mean)) in row.iter_mut().zip(&densities).zip(sensitivity.iter().zip(&mean)) {
                             *r = scale * d * (s - mean);

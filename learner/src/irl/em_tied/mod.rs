@@ -13,6 +13,7 @@ mod likelihood;
 mod standard_errors;
 
 pub use finite::FiniteLikelihood;
+pub(super) use likelihood::of as soft_likelihood;
 pub use likelihood::{Likelihood, SoftLikelihood};
 pub use standard_errors::{MAX_STANDARD_ERRORS, standard_errors};
 

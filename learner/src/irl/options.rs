@@ -70,9 +70,9 @@ pub enum PosteriorKind {
 #[serde(rename_all = "kebab-case")]
 pub enum RewardPrior {
     /// Uniform on [0, 1].
-    #[default]
     Uniform,
-    /// Exponential on [0, 1]: most rewards are small.
+    /// Exponential on [0, 1], density ∝ exp(−5w): most rewards are small.
+    #[default]
     Exponential,
     /// Beta(½, ½): rewards are near 0 or near 1.
     Beta,

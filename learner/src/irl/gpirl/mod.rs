@@ -107,7 +107,12 @@ struct Laplace {
 
 impl Laplace {
     /// Searches the mode from `start` on, in coordinates z with u = Lz, K = LLᵀ, in which the prior is white.
-    fn new(kernel: &Kernel, theta: &[f64], likelihood: &mut dyn SoftLikelihood, start: Vec<f64>) -> Result<Self, FitError> {
+    fn new(
+        kernel: &Kernel,
+        theta: &[f64],
+        likelihood: &mut dyn SoftLikelihood,
+        start: Vec<f64>,
+    ) -> Result<Self, FitError> {
         let no_factor = || FitError::InvalidOption {
             field: "basis",
             message: "expected features whose covariance is positive definite, got one that is not".to_owned(),
@@ -137,8 +142,9 @@ impl Laplace {
             None => {
                 let too_sharp = || FitError::InvalidOption {
                     field: "discount",
-                    message: "expected a discount at which the curvature of the likelihood is a number, got one too near 1"
-                        .to_owned(),
+                    message:
+                        "expected a discount at which the curvature of the likelihood is a number, got one too near 1"
+                            .to_owned(),
                 };
                 if curvature.iter().any(|c| !c.is_finite()) {
                     return Err(too_sharp());
@@ -207,7 +213,7 @@ fn finish(
     Ok(Fit {
         weights,
         reward,
-        policy: likelihood.policy().to_vec(),
+        policy: Policy::boltzmann(n_actions, likelihood.action_values(), 1.0).into_probabilities(),
         greedy_policy: Policy::greedy(n_actions, likelihood.action_values()).into_probabilities(),
         state_values: likelihood.state_values().to_vec(),
         standard_errors: None,

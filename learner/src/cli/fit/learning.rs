@@ -158,7 +158,7 @@ pub struct LearningArgs {
     /// What em-tied acts on [default: hmc]
     #[arg(long, value_enum, value_name = "KIND", help_heading = "Learning")]
     pub posterior: Option<PosteriorArg>,
-    /// Prior of birl over the reward of each basis function [default: uniform]
+    /// Prior of birl over the reward of each basis function [default: exponential]
     #[arg(long, value_enum, value_name = "PRIOR", help_heading = "Learning")]
     pub reward_prior: Option<RewardPriorArg>,
     /// How sharply birl's expert prefers better actions [default: 10]

@@ -124,7 +124,7 @@ impl<'a> Chain<'a> {
     }
 
     /// The warm-up's schedule: the likelihood comes to its full power in the first quarter, lest a chain be caught where it
-    /// happened to begin (simulated tempering, downward only); metrics of single points at first, then of the mean over points that look like the posterior.
+    /// happened to begin; metrics of single points at first, then of the mean over points that look like the posterior.
     fn adapt(&mut self, acceptance: f64) {
         self.step.update(acceptance);
         let (i, w) = (self.iteration, self.warm_up);

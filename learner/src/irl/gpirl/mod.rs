@@ -134,27 +134,23 @@ impl Laplace {
         curvature = (&curvature + curvature.transpose()) * 0.5;
         let n = curvature.nrows();
         let identity = DMatrix::identity(n, n);
-        let (inverse, log_determinant, concave) = match Cholesky::new(&identity + &curvature) {
-            Some(factor) => {
-                (factor.inverse(), 2.0 * factor.l_dirty().diagonal().iter().map(|d| d.ln()).sum::<f64>(), true)
-            }
+        let (inverse, log_determinant, concave) = if let Some(factor) = Cholesky::new(&identity + &curvature) {
+            (factor.inverse(), 2.0 * factor.l_dirty().diagonal().iter().map(|d| d.ln()).sum::<f64>(), true)
+        } else {
             // the log-likelihood is not concave: where it bends upward, the prior's own precision counts
-            None => {
-                let too_sharp = || FitError::InvalidOption {
-                    field: "discount",
-                    message:
-                        "expected a discount at which the curvature of the likelihood is a number, got one too near 1"
-                            .to_owned(),
-                };
-                if curvature.iter().any(|c| !c.is_finite()) {
-                    return Err(too_sharp());
-                }
-                let eigen = SymmetricEigen::try_new(curvature, f64::EPSILON, 10_000).ok_or_else(too_sharp)?;
-                let precisions = eigen.eigenvalues.map(|e| 1.0 + e.max(0.0));
-                let scaled = DMatrix::from_diagonal(&precisions.map(|p| 1.0 / p));
-                let inverse = &eigen.eigenvectors * scaled * eigen.eigenvectors.transpose();
-                (inverse, precisions.iter().map(|p: &f64| p.ln()).sum::<f64>(), false)
+            let too_sharp = || FitError::InvalidOption {
+                field: "discount",
+                message: "expected a discount at which the curvature of the likelihood is a number, got one too near 1"
+                    .to_owned(),
+            };
+            if curvature.iter().any(|c| !c.is_finite()) {
+                return Err(too_sharp());
             }
+            let eigen = SymmetricEigen::try_new(curvature, f64::EPSILON, 10_000).ok_or_else(too_sharp)?;
+            let precisions = eigen.eigenvalues.map(|e| 1.0 + e.max(0.0));
+            let scaled = DMatrix::from_diagonal(&precisions.map(|p| 1.0 / p));
+            let inverse = &eigen.eigenvectors * scaled * eigen.eigenvectors.transpose();
+            (inverse, precisions.iter().map(|p: &f64| p.ln()).sum::<f64>(), false)
         };
         let covariance = &lower * inverse * lower.transpose();
         let log_evidence = log_likelihood - 0.5 * z.norm_squared() - 0.5 * log_determinant + kernel.log_prior(theta);

@@ -53,13 +53,13 @@ fn the_posterior_is_that_of_quadrature() {
         let rate = if prior == RewardPrior::Exponential { 5.0 } else { 0.0 };
         let (mut mass, mut first, mut second) = (0.0, [0.0; 2], [0.0; 2]);
         let mut marginal = vec![0.0; cells as usize];
-        for i in 0..cells as usize {
+        for (i, marginal) in marginal.iter_mut().enumerate() {
             for j in 0..cells as usize {
                 let w = [at(i), at(j)];
                 let q = optimal(&process, &w, discount);
                 let p = (log_likelihood(&q, &counts, 2, 3.0) - rate * (w[0] + w[1])).exp();
                 mass += p;
-                marginal[i] += p;
+                *marginal += p;
                 for b in 0..2 {
                     first[b] += p * w[b];
                     second[b] += p * w[b] * w[b];

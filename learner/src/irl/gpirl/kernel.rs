@@ -159,7 +159,7 @@ impl Kernel {
         }
     }
 
-    /// −E[log p(u|θ)] − log p(θ) for E[uuᵀ] = `second_moment`, up to a constant, and its derivative:
+    /// −E[log p(u|θ)] − log p(θ) for ⟨uuᵀ⟩ = `second_moment`, up to a constant, and its derivative:
     /// ½ tr(K⁻¹S) + ½ log|K|, with derivative ½ (K⁻¹ − K⁻¹SK⁻¹) by K.
     pub(super) fn expected_cost(&self, theta: &[f64], second_moment: &DMatrix<f64>) -> (f64, Vec<f64>) {
         let Some(factor) = factor(self.matrix(theta)) else {

@@ -157,7 +157,7 @@ impl Laplace {
         Ok(Self { mode: mode.as_slice().to_vec(), covariance, log_evidence, concave })
     }
 
-    /// E[uuᵀ].
+    /// ⟨uuᵀ⟩, the second moment of the rewards.
     fn second_moment(&self) -> DMatrix<f64> {
         let mode = DVector::from_column_slice(&self.mode);
         &self.covariance + &mode * mode.transpose()

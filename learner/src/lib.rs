@@ -7,6 +7,8 @@
 pub mod config;
 pub mod eval;
 #[cfg(feature = "service")]
+pub mod files;
+#[cfg(feature = "service")]
 mod grpc;
 pub mod irl;
 pub mod mdp;

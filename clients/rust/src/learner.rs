@@ -1,6 +1,6 @@
 //! A learner service: models, recordings and fits, in the messages of `mazeway.learner.v1`.
 
-use crate::{ClientError, Model, Recorder, connection::channel};
+use crate::{ClientError, Model, ModelCollector, Recorder, connection::channel};
 use mazeway_proto::{
     env::ModelPart,
     learner::{self as pb, fit_response::Event, learner_service_client::LearnerServiceClient},
@@ -49,12 +49,39 @@ impl Learner {
         self.put_model_parts(model.parts().collect()).await
     }
 
+    /// As [`Learner::put_model`]; where the rows are stored with another header (labels, features, start, rewards), this one
+    /// takes its place.
+    ///
+    /// # Errors
+    /// A model that the learner refuses.
+    pub async fn replace_model(&self, model: &Model) -> Result<pb::PutModelResponse, ClientError> {
+        self.send_model(model.parts().collect(), true).await
+    }
+
+    /// A stored model.
+    ///
+    /// # Errors
+    /// No such model.
+    pub async fn model(&self, model_id: &str) -> Result<Model, ClientError> {
+        let request = pb::GetModelRequest { model_id: model_id.into() };
+        let mut parts = self.service.clone().get_model(request).await?.into_inner();
+        let mut collector = ModelCollector::default();
+        while let Some(response) = parts.message().await? {
+            collector.push(response.part.unwrap_or_default())?;
+        }
+        Ok(collector.finish()?)
+    }
+
     /// Stores a model that is there in parts: a header, then blocks of rows.
     ///
     /// # Errors
     /// A model that the learner refuses.
     pub async fn put_model_parts(&self, parts: Vec<ModelPart>) -> Result<pb::PutModelResponse, ClientError> {
-        let requests = parts.into_iter().map(|part| pb::PutModelRequest { part: Some(part) });
+        self.send_model(parts, false).await
+    }
+
+    async fn send_model(&self, parts: Vec<ModelPart>, replace: bool) -> Result<pb::PutModelResponse, ClientError> {
+        let requests = parts.into_iter().map(move |part| pb::PutModelRequest { part: Some(part), replace });
         Ok(self.service.clone().put_model(tokio_stream::iter(requests)).await?.into_inner())
     }
 

@@ -37,7 +37,7 @@ pub use env::{Env, Step};
 pub use error::ClientError;
 pub use info::{Infos, Observation, Observations};
 pub use learner::Learner;
-pub use model::{Grid, Model, ModelCollector, ModelError, ModelLimits};
+pub use model::{FeatureDomain, FeatureTable, Grid, Model, ModelCollector, ModelError, ModelLimits};
 pub use recorder::{Demonstration, Receipt, Recorder};
 pub use rollout::{Controller, Episode, EpisodeStream, Episodes, Rollout};
 pub use session::{Autoreset, Image, SessionOptions};

@@ -31,6 +31,26 @@ pub struct Grid {
     pub cells: Vec<u32>,
 }
 
+/// What the rows of a feature table stand for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum FeatureDomain {
+    /// One row a state, the same for every action.
+    States,
+    /// One row a state-action pair.
+    StateActions,
+}
+
+/// Named columns of numbers of which a reward may be a weighted sum.
+#[derive(Debug, Clone, PartialEq)]
+pub struct FeatureTable {
+    /// Name of each feature, shape `(n_features,)`.
+    pub names: Vec<String>,
+    /// What the rows stand for.
+    pub domain: FeatureDomain,
+    /// Row-major, shape `(n_states or n_states * n_actions, n_features)`.
+    pub values: Vec<f64>,
+}
+
 /// A finite Markov decision process as sparse rows (s, a), in order of `s * n_actions + a`.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Model {
@@ -62,6 +82,10 @@ pub struct Model {
     pub rewards: Vec<(String, Vec<f64>)>,
     /// Where the states lie on a grid, if they do.
     pub grid: Option<Grid>,
+    /// Features, where any are known.
+    pub features: Option<FeatureTable>,
+    /// States that no action leaves, rising.
+    pub terminal_states: Vec<u32>,
 }
 
 /// Parts that are no model: which field and why.
@@ -161,6 +185,15 @@ impl Model {
                 columns: grid.columns,
                 cells: pack(grid.cells.iter().copied()),
             }),
+            features: self.features.as_ref().map(|table| pb::FeatureTable {
+                names: table.names.clone(),
+                domain: match table.domain {
+                    FeatureDomain::States => pb::FeatureDomain::State,
+                    FeatureDomain::StateActions => pb::FeatureDomain::StateAction,
+                } as i32,
+                values: pack(table.values.iter().copied()),
+            }),
+            terminal_states: pack(self.terminal_states.iter().copied()),
         }
     }
 
@@ -311,6 +344,24 @@ fn begin(header: pb::ModelHeader, limits: ModelLimits) -> Result<Model, ModelErr
             }
         }
     });
+    let features = header.features.map(|table| {
+        let (domain, rows) = match pb::FeatureDomain::try_from(table.domain) {
+            Ok(pb::FeatureDomain::State) => (FeatureDomain::States, n_states as usize),
+            Ok(pb::FeatureDomain::StateAction) => (FeatureDomain::StateActions, n_rows as usize),
+            Ok(pb::FeatureDomain::Unspecified) | Err(_) => {
+                let message = format!("expected states or state-action pairs, got {}", table.domain);
+                return Err(ModelError::new("header.features.domain", message));
+            }
+        };
+        let values: Vec<f64> = unpack("header.features.values", table.values, rows * table.names.len())?;
+        Ok(FeatureTable { names: table.names, domain, values })
+    });
+    let n_terminal = header.terminal_states.len() / 4;
+    let terminal_states: Vec<u32> = unpack("header.terminal_states", header.terminal_states, n_terminal)?;
+    if let Some(state) = terminal_states.iter().find(|&&state| state >= n_states) {
+        let message = format!("expected states below {n_states}, got {state}");
+        return Err(ModelError::new("header.terminal_states", message));
+    }
     Ok(Model {
         env_id: header.env_id,
         model_id: header.model_id,
@@ -326,6 +377,8 @@ fn begin(header: pb::ModelHeader, limits: ModelLimits) -> Result<Model, ModelErr
         estimated: header.estimated,
         rewards,
         grid: grid.transpose()?,
+        features: features.transpose()?,
+        terminal_states,
     })
 }
 

@@ -90,6 +90,7 @@ impl From<StoreError> for CliError {
             StoreError::Busy { .. } => "stop the other program, or use another directory with --data DIR",
             StoreError::Corrupt { .. } => "restore the directory from a copy, or use another with --data DIR",
             StoreError::TrajectoryExists { .. }
+            | StoreError::ModelExists { .. }
             | StoreError::AmbiguousFit { .. }
             | StoreError::Closed
             | StoreError::Database { .. } => "check that you may write there, or use another directory with --data DIR",

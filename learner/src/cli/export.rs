@@ -1,11 +1,13 @@
 //! `learner export` and `learner delete`: whole trajectories out of the store.
 
-use super::{StoreArgs, connect::connect, error::CliError};
+use super::{StoreArgs, connect::connect, error::CliError, models};
 use clap::{Args, ValueEnum};
-use mazeway_client::{Learner, packed::Packed};
+use mazeway_client::{Code, Learner, packed::Packed};
+use mazeway_learner::files::{COLUMNS, Names, Naming, ParquetExport, Step};
 use mazeway_proto::learner as pb;
 use serde_json::{Value, json};
 use std::{
+    collections::BTreeMap,
     fs::File,
     io::{self, BufWriter, Write},
     path::PathBuf,
@@ -51,6 +53,8 @@ enum Format {
     Jsonl,
     /// One line a step, under a header
     Csv,
+    /// One row a step
+    Parquet,
 }
 
 /// What to write, how and where.
@@ -64,40 +68,156 @@ pub struct ExportArgs {
     /// Where to; standard output unless said
     #[arg(long, value_name = "FILE")]
     out: Option<PathBuf>,
+    /// Write states and actions by the labels of the environment's model rather than by their indices
+    #[arg(long)]
+    labels: bool,
     #[command(flatten)]
     store: StoreArgs,
 }
 
 /// Writes trajectories, in the order in which they were recorded.
 pub async fn export(args: ExportArgs) -> Result<(), CliError> {
-    let mut out: Box<dyn Write + Send> = match &args.out {
+    let out: Box<dyn Write + Send> = match &args.out {
         None => Box::new(BufWriter::new(io::stdout())),
         Some(path) => Box::new(BufWriter::new(File::create(path).map_err(|error| {
             CliError::failure(format!("cannot write {}: {error}", path.display()), "choose another file with --out")
         })?)),
     };
     let connected = connect(&args.store).await?;
-    let written = write(&args, &connected.learner, &mut out).await;
+    let written = write(&args, &connected.learner, out).await;
     connected.finish(written).await
 }
 
-async fn write(args: &ExportArgs, learner: &Learner, out: &mut (dyn Write + Send)) -> Result<(), CliError> {
+/// Where trajectories go.
+enum Sink {
+    Text(Box<dyn Write + Send>),
+    Parquet(Box<ParquetExport<Box<dyn Write + Send>>>),
+}
+
+async fn write(args: &ExportArgs, learner: &Learner, mut out: Box<dyn Write + Send>) -> Result<(), CliError> {
+    let mut labels = Labels { wanted: args.labels, models: BTreeMap::new() };
     let mut pages = learner.export_trajectories(&args.filter.filter()).await?;
     if args.format == Format::Csv {
-        writeln!(out, "{CSV_HEADER}")?;
+        writeln!(out, "{}", COLUMNS.join(","))?;
     }
+    let mut sink = match args.format {
+        Format::Parquet => Sink::Parquet(Box::new(ParquetExport::new(out, args.labels).map_err(cannot_write)?)),
+        Format::Csv | Format::Jsonl => Sink::Text(out),
+    };
     while let Some(page) = pages.next().await? {
         for trajectory in page {
             let torn =
                 || CliError::failure(format!("trajectory {} is torn", trajectory.trajectory_id), "see 'learner list'");
-            let value = plain(&trajectory).ok_or_else(torn)?;
-            match args.format {
-                Format::Jsonl => writeln!(out, "{value}")?,
-                Format::Csv => write_csv(&trajectory, &value, out)?,
+            let names = labels.of(learner, &trajectory).await?;
+            match &mut sink {
+                Sink::Parquet(parquet) => {
+                    let steps = steps(&trajectory).ok_or_else(torn)?;
+                    parquet
+                        .write(&trajectory, steps, names.as_ref().map(|n| n as &dyn Naming))
+                        .map_err(cannot_write)?;
+                }
+                Sink::Text(out) if args.format == Format::Csv => {
+                    write_csv(&trajectory, &steps(&trajectory).ok_or_else(torn)?, names.as_ref(), out)?;
+                }
+                Sink::Text(out) => {
+                    let mut value = plain(&trajectory).ok_or_else(torn)?;
+                    if let Some(names) = &names {
+                        names.relabel(&mut value);
+                    }
+                    writeln!(out, "{value}")?;
+                }
             }
         }
     }
-    Ok(out.flush()?)
+    match sink {
+        Sink::Parquet(parquet) => parquet.finish().map_err(cannot_write),
+        Sink::Text(mut out) => Ok(out.flush()?),
+    }
+}
+
+fn cannot_write(error: impl std::fmt::Display) -> CliError {
+    CliError::failure(format!("could not write: {error}"), "check that the disk has room and that you may write there")
+}
+
+/// What states and actions are called, model by model.
+struct Labels {
+    wanted: bool,
+    models: BTreeMap<String, Option<Called>>,
+}
+
+/// The labels of one model.
+#[derive(Debug, Clone)]
+struct Called(Names, Names);
+
+impl Naming for Called {
+    fn state(&self, index: u32) -> String {
+        self.0.name(index)
+    }
+
+    fn action(&self, index: u32) -> String {
+        self.1.name(index)
+    }
+}
+
+impl Called {
+    /// Puts labels in the place of indices.
+    fn relabel(&self, value: &mut Value) {
+        let index = |value: &Value| value.as_u64().and_then(|index| u32::try_from(index).ok());
+        for (key, name) in [("states", &self.0), ("actions", &self.1)] {
+            for cell in value[key].as_array_mut().into_iter().flatten() {
+                if let Some(index) = index(cell) {
+                    *cell = name.name(index).into();
+                }
+            }
+        }
+        if let Some(last) = index(&value["final_state"]) {
+            value["final_state"] = self.0.name(last).into();
+        }
+    }
+}
+
+impl Labels {
+    /// The labels of a trajectory's model; `None` where they are not wanted or not known.
+    async fn of(&mut self, learner: &Learner, trajectory: &pb::Trajectory) -> Result<Option<Called>, CliError> {
+        if !self.wanted {
+            return Ok(None);
+        }
+        let id = &trajectory.model_id;
+        if !self.models.contains_key(id) {
+            let model = if id.is_empty() { None } else { known(learner.model(id).await)? };
+            self.models.insert(id.clone(), model.map(|model| models::names(&model)).map(|(s, a)| Called(s, a)));
+        }
+        let plain =
+            || Called(Names::numbered("state", trajectory.n_states), Names::numbered("action", trajectory.n_actions));
+        Ok(Some(self.models[id].clone().unwrap_or_else(plain)))
+    }
+}
+
+/// What is asked for, where it is there.
+pub fn known<T>(answer: Result<T, mazeway_client::ClientError>) -> Result<Option<T>, CliError> {
+    match answer {
+        Ok(value) => Ok(Some(value)),
+        Err(error) if error.code() == Code::NotFound => Ok(None),
+        Err(error) => Err(error.into()),
+    }
+}
+
+/// A trajectory step by step; `None` where an array is torn.
+fn steps(t: &pb::Trajectory) -> Option<Vec<Step>> {
+    let states = Packed::<u32>::new(t.states.clone())?.to_vec();
+    let actions = Packed::<u32>::new(t.actions.clone())?.to_vec();
+    let rewards = Packed::<f64>::new(t.rewards.clone())?.to_vec();
+    let last = states.len().checked_sub(1);
+    let step = |(step, &state): (usize, &u32)| Step {
+        step: step as u64,
+        state,
+        action: actions.get(step).copied(),
+        reward: rewards.get(step).copied(),
+        next_state: states.get(step + 1).copied().or(t.final_state),
+        terminated: Some(step) == last && t.terminated,
+        truncated: Some(step) == last && t.truncated,
+    };
+    Some(states.iter().enumerate().map(step).collect())
 }
 
 /// A trajectory in plain arrays; `None` where one is torn.
@@ -120,28 +240,26 @@ pub fn plain(t: &pb::Trajectory) -> Option<Value> {
     }))
 }
 
-const CSV_HEADER: &str =
-    "id,env,model,style,source,seed,n_states,n_actions,step,state,action,reward,next_state,terminated,truncated";
-
 /// One line a step. `terminated` and `truncated` are those of the step: true on the last one at most.
-fn write_csv(t: &pb::Trajectory, value: &Value, out: &mut (dyn Write + Send)) -> io::Result<()> {
+fn write_csv(t: &pb::Trajectory, steps: &[Step], names: Option<&Called>, out: &mut dyn Write) -> io::Result<()> {
     let seed = t.seed.map(|seed| seed.to_string()).unwrap_or_default();
     let labels = [&t.trajectory_id, &t.env_id, &t.model_id, &t.style, &t.source].map(|text| quoted(text)).join(",");
-    let steps = value["states"].as_array().map_or(0, Vec::len);
-    for step in 0..steps {
-        let last = step + 1 == steps;
-        let cell = |value: &Value| if value.is_null() { String::new() } else { value.to_string() };
-        let next = if last { cell(&value["final_state"]) } else { cell(&value["states"][step + 1]) };
+    let state = |index: u32| names.map_or_else(|| index.to_string(), |names| quoted(&names.state(index)));
+    let action = |index: u32| names.map_or_else(|| index.to_string(), |names| quoted(&names.action(index)));
+    for step in steps {
         writeln!(
             out,
-            "{labels},{seed},{},{},{step},{},{},{},{next},{},{}",
+            "{labels},{seed},{},{},{},{},{},{},{},{},{}",
             t.n_states,
             t.n_actions,
-            value["states"][step],
-            cell(&value["actions"][step]),
-            cell(&value["rewards"][step]),
-            last && t.terminated,
-            last && t.truncated,
+            step.step,
+            state(step.state),
+            step.action.map(action).unwrap_or_default(),
+            // As JSON writes it: every digit that is needed, and a point.
+            step.reward.map(|reward| Value::from(reward).to_string()).unwrap_or_default(),
+            step.next_state.map(state).unwrap_or_default(),
+            step.terminated,
+            step.truncated,
         )?;
     }
     Ok(())
@@ -222,7 +340,7 @@ mod tests {
             ..Default::default()
         };
         let mut out = Vec::new();
-        write_csv(&trajectory, &plain(&trajectory).unwrap(), &mut out).unwrap();
+        write_csv(&trajectory, &steps(&trajectory).unwrap(), None, &mut out).unwrap();
         let lines = String::from_utf8(out).unwrap();
         let expected = [
             "t,\"a, \"\"b\"\"\",,s,,7,9,4,0,1,3,0.5,2,false,false",

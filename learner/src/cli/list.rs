@@ -84,6 +84,7 @@ struct ModelRow {
     n_transitions: u64,
     estimated: bool,
     styles: Vec<String>,
+    features: Vec<String>,
     stored_at: String,
 }
 
@@ -197,6 +198,7 @@ fn model_row(m: pb::ModelSummary) -> ModelRow {
         n_transitions: m.n_transitions,
         estimated: m.estimated,
         styles: m.styles,
+        features: m.features,
         stored_at: time(m.stored_at),
     }
 }

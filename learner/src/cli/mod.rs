@@ -9,7 +9,9 @@ pub mod embedded;
 pub mod error;
 mod export;
 pub mod fit;
+mod import;
 mod list;
+mod models;
 mod scene;
 mod serve;
 mod show;
@@ -35,11 +37,13 @@ enum Command {
     Fit(Box<fit::FitArgs>),
     /// Compare methods on the same demonstrations, over numbers of demonstrations and seeds
     Compare(Box<compare::CompareArgs>),
+    /// Store a model and demonstrations from files
+    Import(Box<import::ImportArgs>),
     /// List recordings, models and fits
     List(list::ListArgs),
     /// Show a fit, a trajectory or a model
     Show(show::ShowArgs),
-    /// Write trajectories as JSON lines or CSV
+    /// Write trajectories as JSON lines, CSV or Parquet
     Export(export::ExportArgs),
     /// Delete trajectories or a fit
     Delete(export::DeleteArgs),
@@ -105,6 +109,7 @@ async fn run(command: Command) -> Result<(), CliError> {
     match command {
         Command::Fit(args) => fit::run(*args).await,
         Command::Compare(args) => compare::run(*args).await,
+        Command::Import(args) => import::run(*args).await,
         Command::List(args) => list::run(args).await,
         Command::Show(args) => show::run(args).await,
         Command::Export(args) => export::export(args).await,

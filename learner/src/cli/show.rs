@@ -4,11 +4,14 @@ use super::{
     StoreArgs,
     connect::connect,
     error::CliError,
+    export::known,
     list::stopped,
+    models,
     table::{facts, table, time},
 };
 use clap::Args;
 use mazeway_client::{ClientError, Code, Learner, packed::Packed};
+use mazeway_learner::files::Names;
 use mazeway_proto::learner as pb;
 use serde_json::{Value, json};
 use std::io::Write as _;
@@ -48,24 +51,44 @@ pub async fn run(args: ShowArgs) -> Result<(), CliError> {
         ));
     }
     let connected = connect(&args.store).await?;
-    let found = find(&connected.learner, &id).await;
-    let found = connected.finish(found).await?;
+    let found = find_named(&connected.learner, &id).await;
+    let (found, names) = connected.finish(found).await?;
     let mut out = std::io::stdout().lock();
     if args.json {
         let value = match &found {
-            Found::Fit(fit) => fit_json(fit)?,
+            Found::Fit(fit) => fit_json(fit, &names)?,
             Found::Trajectory(trajectory) => trajectory_json(trajectory)?,
             Found::Model(model) => model_json(model),
         };
         writeln!(out, "{value}")?;
     } else {
         match &found {
-            Found::Fit(fit) => write!(out, "{}", fit_text(fit)?)?,
-            Found::Trajectory(trajectory) => write!(out, "{}", trajectory_text(trajectory)?)?,
+            Found::Fit(fit) => write!(out, "{}", fit_text(fit, &names)?)?,
+            Found::Trajectory(trajectory) => write!(out, "{}", trajectory_text(trajectory, &names)?)?,
             Found::Model(model) => write!(out, "{}", model_text(model))?,
         }
     }
     Ok(out.flush()?)
+}
+
+/// Finds it, and what its states and actions are called: by the labels of its model where that is known.
+async fn find_named(learner: &Learner, id: &str) -> Result<(Found, (Names, Names)), CliError> {
+    let found = find(learner, id).await?;
+    let (model_id, n_states, n_actions) = match &found {
+        Found::Fit(fit) => (&fit.model_id, fit.n_states, fit.n_actions),
+        Found::Trajectory(t) => (&t.model_id, t.n_states, t.n_actions),
+        Found::Model(m) => return Ok((found_model(m), (Names::numbered("state", 0), Names::numbered("action", 0)))),
+    };
+    let model = if model_id.is_empty() { None } else { known(learner.model(model_id).await)? };
+    let names = match model.filter(|m| (m.n_states, m.n_actions) == (n_states, n_actions)) {
+        Some(model) => models::names(&model),
+        None => (Names::numbered("state", n_states), Names::numbered("action", n_actions)),
+    };
+    Ok((found, names))
+}
+
+fn found_model(model: &pb::ModelSummary) -> Found {
+    Found::Model(Box::new(model.clone()))
 }
 
 async fn find(learner: &Learner, id: &str) -> Result<Found, CliError> {
@@ -114,7 +137,7 @@ fn by_state(values: &[f64], n_actions: usize) -> Vec<Vec<f64>> {
     values.chunks(n_actions.max(1)).map(<[f64]>::to_vec).collect()
 }
 
-fn fit_json(fit: &pb::Fit) -> Result<Value, CliError> {
+fn fit_json(fit: &pb::Fit, names: &(Names, Names)) -> Result<Value, CliError> {
     let (s, a) = (fit.n_states as usize, fit.n_actions as usize);
     let weights = array(&fit.weights, fit.weights.len() / 8, "weights")?;
     let request = fit.request.clone().unwrap_or_default();
@@ -141,6 +164,9 @@ fn fit_json(fit: &pb::Fit) -> Result<Value, CliError> {
         "log_likelihood_per_step": fit.log_likelihood_per_step,
         "states_covered": fit.states_covered,
         "warnings": fit.warnings,
+        "state_labels": names.0.labels(),
+        "action_labels": names.1.labels(),
+        "features": fit.feature_names,
         "weights": weights,
         "standard_errors": array(&fit.standard_errors, fit.standard_errors.len() / 8, "standard errors")?,
         "reward": by_state(&array(&fit.reward, s * a, "the reward")?, a),
@@ -157,7 +183,7 @@ fn options_json(options: &pb::FitOptions) -> Value {
     mazeway_learner::fit_options(Some(options)).ok().and_then(|o| serde_json::to_value(o).ok()).unwrap_or(Value::Null)
 }
 
-fn fit_text(fit: &pb::Fit) -> Result<String, CliError> {
+fn fit_text(fit: &pb::Fit, names: &(Names, Names)) -> Result<String, CliError> {
     let (s, a) = (fit.n_states as usize, fit.n_actions as usize);
     let request = fit.request.clone().unwrap_or_default();
     let options = match options_json(&request.options.unwrap_or_default()) {
@@ -188,6 +214,13 @@ fn fit_text(fit: &pb::Fit) -> Result<String, CliError> {
         text.push_str(warning);
         text.push('\n');
     }
+    if !fit.feature_names.is_empty() {
+        let weights = array(&fit.weights, fit.feature_names.len(), "the weights")?;
+        let rows = fit.feature_names.iter().zip(weights).map(|(name, weight)| [name.clone(), format!("{weight:.4}")]);
+        text.push('\n');
+        text.push_str(&table(["feature", "#weight"], rows));
+        text.push('\n');
+    }
     let visits = array(&fit.state_visits, s, "the state visits")?;
     let values = array(&fit.state_values, s, "the state values")?;
     let greedy = by_state(&array(&fit.greedy_policy, s * a, "the greedy policy")?, a);
@@ -196,10 +229,10 @@ fn fit_text(fit: &pb::Fit) -> Result<String, CliError> {
     let rows = (0..s.min(MOST_ROWS)).map(|state| {
         let best = (0..a).filter(|&action| greedy[state][action] > 0.0).collect::<Vec<_>>();
         let likely = best.iter().map(|&action| policy[state][action]).sum::<f64>();
-        let actions = best.iter().map(usize::to_string).collect::<Vec<_>>().join(" ");
+        let actions = best.iter().map(|&action| names.1.name(action as u32)).collect::<Vec<_>>().join(" ");
         let gain = best.iter().map(|&action| reward[state][action]).fold(f64::NEG_INFINITY, f64::max);
         let (visits, value) = (format!("{}", visits[state]), format!("{:.4}", values[state]));
-        [state.to_string(), visits, value, actions, format!("{gain:.4}"), format!("{likely:.3}")]
+        [names.0.name(state as u32), visits, value, actions, format!("{gain:.4}"), format!("{likely:.3}")]
     });
     text.push('\n');
     text.push_str(&table(["#state", "#visits", "#value", "greedy action", "#its reward", "#its probability"], rows));
@@ -222,7 +255,7 @@ fn trajectory_json(t: &pb::Trajectory) -> Result<Value, CliError> {
     Ok(value)
 }
 
-fn trajectory_text(t: &pb::Trajectory) -> Result<String, CliError> {
+fn trajectory_text(t: &pb::Trajectory, names: &(Names, Names)) -> Result<String, CliError> {
     let (states, actions) = (indices(&t.states)?, indices(&t.actions)?);
     let rewards = array(&t.rewards, if t.rewards.is_empty() { 0 } else { states.len() }, "the rewards")?;
     let ended = match (t.terminated, t.truncated) {
@@ -240,14 +273,14 @@ fn trajectory_text(t: &pb::Trajectory) -> Result<String, CliError> {
         ("sizes", format!("{} states, {} actions", t.n_states, t.n_actions)),
         ("steps", states.len().to_string()),
         ("return", if rewards.is_empty() { String::new() } else { format!("{:.4}", rewards.iter().sum::<f64>()) }),
-        ("final state", t.final_state.map(|state| state.to_string()).unwrap_or_default()),
+        ("final state", t.final_state.map(|state| names.0.name(state)).unwrap_or_default()),
         ("then", ended.into()),
     ]);
     text.push('\n');
     let rows = states.iter().enumerate().take(MOST_ROWS).map(|(step, state)| {
-        let action = actions.get(step).map(u32::to_string).unwrap_or_default();
+        let action = actions.get(step).map(|&action| names.1.name(action)).unwrap_or_default();
         let reward = rewards.get(step).map(f64::to_string).unwrap_or_default();
-        [step.to_string(), state.to_string(), action, reward]
+        [step.to_string(), names.0.name(*state), action, reward]
     });
     text.push_str(&table(["#step", "#state", "#action", "#reward"], rows));
     text.push('\n');
@@ -265,6 +298,8 @@ fn model_json(m: &pb::ModelSummary) -> Value {
         "n_transitions": m.n_transitions,
         "estimated": m.estimated,
         "styles": m.styles,
+        "features": m.features,
+        "n_terminal_states": m.n_terminal_states,
         "stored_at": time(m.stored_at),
     })
 }
@@ -276,6 +311,8 @@ fn model_text(m: &pb::ModelSummary) -> String {
         ("sizes", format!("{} states, {} actions, {} transitions", m.n_states, m.n_actions, m.n_transitions)),
         ("kind", if m.estimated { "estimated" } else { "exact" }.into()),
         ("rewards", m.styles.join(", ")),
+        ("features", m.features.join(", ")),
+        ("terminal states", if m.n_terminal_states > 0 { m.n_terminal_states.to_string() } else { String::new() }),
         ("stored at", time(m.stored_at)),
     ])
 }

@@ -4,13 +4,13 @@ use super::{from_proto, options, status::CallError};
 use crate::{
     config::Limits,
     eval,
-    irl::{self, FitError, FitOptions, LatentActions, Method, Problem, TraceEntry},
-    mdp::TabularMdp,
+    irl::{self, BasisKind, FitError, FitOptions, LatentActions, Method, Problem, TraceEntry},
+    mdp::{Features, TabularMdp},
     statistics::{Statistics, StatisticsBuilder},
     store::{FieldError, Filter, Model, Recording, Store, check_model_id, clip, pack_f64, unpack_f64, unpack_u32},
     trajectory::Demonstrations,
 };
-use mazeway_proto::learner as pb;
+use mazeway_proto::{env::FeatureDomain, learner as pb};
 use std::{ops::ControlFlow, time::Instant};
 use uuid::Uuid;
 
@@ -77,17 +77,26 @@ impl FitJob {
         let model = asked.map_or_else(|| load(&data.model_id), Ok)?;
         check_sizes(&model, &data)?;
         let mdp = mdp(&model)?;
+        let features = features(&model)?;
         let problem = Problem {
             mdp: &mdp,
             options: &self.options,
             statistics: &data.statistics,
             demonstrations: data.demonstrations.as_ref(),
-            features: None,
+            features: features.as_ref(),
         };
         let begun = Instant::now();
         let fit = irl::fit(self.method, &problem, &mut progress).map_err(refused)?;
         let judged = judge(&mdp, &data.statistics, &fit)?;
-        Ok(self.describe(&model, data, &fit, judged, begun.elapsed().as_secs_f64()))
+        let feature_names = match (&features, self.options.basis) {
+            (Some(features), BasisKind::Features) if self.options.features.is_empty() => features.names().to_vec(),
+            (_, BasisKind::Features) => self.options.features.clone(),
+            _ => Vec::new(),
+        };
+        let mut described = self.describe(&model, data, &fit, judged, begun.elapsed().as_secs_f64());
+        described.feature_names = feature_names;
+        described.warnings.extend(unseen_pairs(&model));
+        Ok(described)
     }
 
     /// Streams the trajectories through the counts.
@@ -139,6 +148,7 @@ impl FitJob {
             iterations: fit.iterations,
             fit_secs,
             warnings: fit.warnings.clone(),
+            feature_names: Vec::new(),
             log_likelihood_per_step: judged.log_likelihood_per_step,
             agreement: judged.agreement,
             states_covered: data.statistics.states_covered(None) as u32,
@@ -335,6 +345,29 @@ fn mdp(model: &Model) -> Result<TabularMdp, CallError> {
         if start.is_empty() { None } else { Some(unpack_f64(start).collect()) },
     )
     .map_err(|e| CallError::Internal(format!("model {}: {e}", model.model_id())))
+}
+
+/// The features of a stored model, spread over its state-action pairs.
+fn features(model: &Model) -> Result<Option<Features>, CallError> {
+    let header = model.header();
+    let Some(table) = &header.features else { return Ok(None) };
+    let (n_states, n_actions) = (header.n_states as usize, header.n_actions as usize);
+    let (names, values) = (table.names.clone(), unpack_f64(&table.values).collect::<Vec<_>>());
+    let features = match FeatureDomain::try_from(table.domain) {
+        Ok(FeatureDomain::State) => Features::of_states(n_states, n_actions, names, &values),
+        _ => Features::of_pairs(n_states * n_actions, names, &values),
+    };
+    features.map(Some).map_err(|e| CallError::Internal(format!("model {}: {e}", model.model_id())))
+}
+
+/// Says where an estimated model has no data to go by.
+fn unseen_pairs(model: &Model) -> Option<String> {
+    let counts = &model.rows().visit_counts;
+    let unseen = counts.chunks_exact(8).filter(|count| count.iter().all(|&byte| byte == 0)).count();
+    (model.header().estimated && unseen > 0).then(|| {
+        let all = counts.len() / 8;
+        format!("the model has no data for {unseen} of {all} state-action pairs: what they lead to is a guess")
+    })
 }
 
 /// Why a method refused.

@@ -69,6 +69,7 @@ pub fn from_proto(message: Option<&pb::FitOptions>) -> Result<FitOptions, FieldE
         max_iterations: m.max_iterations.unwrap_or(default.max_iterations),
         smoothing: m.smoothing.unwrap_or(default.smoothing),
         seed: m.seed.unwrap_or(default.seed),
+        features: m.features.clone(),
     })
 }
 
@@ -132,6 +133,7 @@ pub fn to_proto(options: &FitOptions) -> pb::FitOptions {
         max_iterations: Some(options.max_iterations),
         smoothing: Some(options.smoothing),
         seed: Some(options.seed),
+        features: options.features.clone(),
     }
 }
 
@@ -186,6 +188,7 @@ mod tests {
             max_iterations: 5,
             smoothing: 0.5,
             seed: u64::MAX,
+            features: vec!["speed".into(), "gap".into()],
         };
         for options in [default, other] {
             assert_eq!(from_proto(Some(&to_proto(&options))).unwrap(), options);

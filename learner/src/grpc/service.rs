@@ -10,7 +10,10 @@ use super::{
     status::CallError,
     to_proto,
 };
-use crate::{config::Limits, store::Store};
+use crate::{
+    config::Limits,
+    store::{Put, Store, check_model_id},
+};
 use futures_util::Stream;
 use mazeway_proto::learner::{self as pb, learner_service_server::LearnerService};
 use std::{pin::Pin, sync::Arc};
@@ -27,7 +30,7 @@ const MAX_TRAJECTORY_PAGE: u32 = 10_000;
 const MAX_FIT_PAGE: u32 = 1_000;
 /// Pages of an export that wait for the reader.
 const EXPORT_QUEUE: usize = 2;
-/// Models that are taken in at a time; further ones wait.
+/// Models that are taken in or given out at a time; further ones wait.
 const CONCURRENT_MODELS: usize = 2;
 
 type BoxStream<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
@@ -37,7 +40,7 @@ pub struct LearnerGrpc {
     store: Store,
     limits: Arc<Limits>,
     fits: FitQueue,
-    models: Semaphore,
+    models: Arc<Semaphore>,
     stopping: CancellationToken,
 }
 
@@ -45,7 +48,7 @@ impl LearnerGrpc {
     /// `stopping` ends recording streams and keeps further fits from beginning; `aborting` ends running fits.
     pub fn new(store: Store, limits: Limits, stopping: CancellationToken, aborting: CancellationToken) -> Self {
         let fits = FitQueue::new(&limits, stopping.clone(), aborting);
-        Self { store, limits: Arc::new(limits), fits, models: Semaphore::new(CONCURRENT_MODELS), stopping }
+        Self { store, limits: Arc::new(limits), fits, models: Arc::new(Semaphore::new(CONCURRENT_MODELS)), stopping }
     }
 
     /// Reads the store off the async threads.
@@ -63,6 +66,7 @@ impl LearnerService for LearnerGrpc {
     type RecordTrajectoriesStream = BoxStream<pb::RecordTrajectoriesResponse>;
     type ExportTrajectoriesStream = ReceiverStream<Result<pb::ExportTrajectoriesResponse, Status>>;
     type FitStream = ReceiverStream<FitEvent>;
+    type GetModelStream = ReceiverStream<Result<pb::GetModelResponse, Status>>;
 
     async fn record_trajectories(
         &self,
@@ -80,13 +84,35 @@ impl LearnerService for LearnerGrpc {
         let _permit = self.models.acquire().await.map_err(|_| CallError::ShuttingDown)?;
         let mut parts = request.into_inner();
         let mut builder = ModelBuilder::default();
+        let mut replace = None;
         while let Some(request) = parts.message().await.map_err(CallError::from)? {
+            replace.get_or_insert(request.replace);
             builder.add(request.part, &self.limits)?;
         }
         let model = blocking(move || builder.finish()).await?;
         let model_id = model.model_id().to_owned();
-        let stored = self.store.put_model(model).await.map_err(CallError::from)?;
-        Ok(Response::new(pb::PutModelResponse { model_id, already_stored: !stored }))
+        let put = self.store.put_model(model, replace.unwrap_or(false)).await.map_err(CallError::from)?;
+        Ok(Response::new(pb::PutModelResponse { model_id, already_stored: put == Put::Known }))
+    }
+
+    async fn get_model(&self, request: Request<pb::GetModelRequest>) -> Result<Response<Self::GetModelStream>, Status> {
+        let permit = Arc::clone(&self.models).acquire_owned().await.map_err(|_| CallError::ShuttingDown)?;
+        let id = request.into_inner().model_id;
+        check_model_id("model_id", &id).map_err(CallError::from)?;
+        let model = self
+            .read(move |store| store.model(&id)?.ok_or(CallError::NotFound { field: "model_id", what: "model", id }))
+            .await?;
+        let (parts, stream) = mpsc::channel(EXPORT_QUEUE);
+        tokio::spawn(async move {
+            // As many models are in memory at a time as there are permits.
+            let _permit = permit;
+            for part in to_proto::model_parts(&model) {
+                if parts.send(Ok(part)).await.is_err() {
+                    return;
+                }
+            }
+        });
+        Ok(Response::new(ReceiverStream::new(stream)))
     }
 
     async fn list_models(

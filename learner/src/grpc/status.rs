@@ -116,6 +116,10 @@ fn store_code(error: &StoreError, message: &str, details: &mut ErrorDetails) -> 
             details.add_bad_request_violation(format!("trajectories[{index}].trajectory_id"), message);
             Code::AlreadyExists
         }
+        StoreError::ModelExists { .. } => {
+            details.add_bad_request_violation("part.header", message);
+            Code::AlreadyExists
+        }
         StoreError::AmbiguousFit { .. } => {
             details.add_bad_request_violation("fit_id", message);
             Code::InvalidArgument

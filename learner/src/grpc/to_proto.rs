@@ -1,7 +1,45 @@
 //! From what the learner works with to messages.
 
-use crate::store::{FitInfo, ModelInfo, Recording, TrajectorySummary, timestamp};
-use mazeway_proto::learner as pb;
+use crate::store::{FitInfo, Model, ModelInfo, Recording, TrajectorySummary, timestamp, unpack_u32};
+use mazeway_proto::{
+    env::{ModelPart, RowBlock, model_part::Part},
+    learner as pb,
+};
+
+/// Rows of a message.
+const ROWS_A_BLOCK: usize = 4096;
+/// Entries after which a message ends.
+const ENTRIES_A_BLOCK: usize = 1 << 15;
+
+/// A model as it travels: a header, then blocks of rows, cut from the packed arrays without a copy.
+pub fn model_parts(model: &Model) -> impl Iterator<Item = pb::GetModelResponse> + '_ {
+    let rows = model.rows();
+    let lengths: Vec<u32> = unpack_u32(&rows.row_lengths).collect();
+    let (mut row, mut entry) = (0, 0);
+    let blocks = std::iter::from_fn(move || {
+        let (first_row, first_entry) = (row, entry);
+        while row < lengths.len() && row - first_row < ROWS_A_BLOCK {
+            let end = entry + lengths[row] as usize;
+            if row > first_row && end - first_entry > ENTRIES_A_BLOCK {
+                break;
+            }
+            (row, entry) = (row + 1, end);
+        }
+        (row > first_row).then(|| {
+            let counts = &rows.visit_counts;
+            Part::Rows(RowBlock {
+                first_row: first_row as u32,
+                row_lengths: rows.row_lengths.slice(first_row * 4..row * 4),
+                next_states: rows.next_states.slice(first_entry * 4..entry * 4),
+                probabilities: rows.probabilities.slice(first_entry * 8..entry * 8),
+                visit_counts: if counts.is_empty() { counts.clone() } else { counts.slice(first_row * 8..row * 8) },
+            })
+        })
+    });
+    std::iter::once(Part::Header(model.header().clone()))
+        .chain(blocks)
+        .map(|part| pb::GetModelResponse { part: Some(ModelPart { part: Some(part) }) })
+}
 
 /// A whole trajectory.
 pub fn trajectory(recording: Recording) -> pb::Trajectory {
@@ -49,6 +87,8 @@ pub fn model_summary(model: ModelInfo) -> pb::ModelSummary {
         estimated: model.header.estimated,
         styles: model.header.rewards.into_iter().map(|table| table.style).collect(),
         stored_at: Some(timestamp(model.stored_at_us)),
+        features: model.header.features.map(|table| table.names).unwrap_or_default(),
+        n_terminal_states: (model.header.terminal_states.len() / 4) as u32,
     }
 }
 

@@ -38,7 +38,7 @@ pub use latent::LatentActions;
 pub use options::{BasisKind, FitOptions, MStep, Penalty, PosteriorKind, Responsibility, RewardPrior};
 
 use self::temperature::most_likely_boltzmann;
-use crate::mdp::{Features, PlanError, PlanOptions, TabularMdp, plan};
+use crate::mdp::{Features, FeaturesError, PlanError, PlanOptions, TabularMdp, plan};
 use crate::statistics::Statistics;
 use crate::trajectory::Demonstrations;
 use serde::{Deserialize, Serialize};
@@ -395,8 +395,19 @@ impl Fit {
 /// Fits with a method; the one entry for every caller. Actions that were not seen are inferred.
 ///
 /// # Errors
-/// As [`Method::fit`]; without actions also transitions that the model cannot make, and methods that need whole trajectories.
+/// As [`Method::fit`]; without actions also transitions that the model cannot make, and methods that need whole trajectories; a
+/// feature that is asked for and that there is not.
 pub fn fit(method: &dyn Method, problem: &Problem<'_>, progress: Progress<'_>) -> Result<Fit, FitError> {
+    let names = &problem.options.features;
+    if let Some(features) = problem.features
+        && problem.options.basis == BasisKind::Features
+        && !names.is_empty()
+    {
+        let unknown = |error: FeaturesError| FitError::InvalidOption { field: "features", message: error.to_string() };
+        let selected = features.select(names).map_err(unknown)?;
+        let options = FitOptions { features: Vec::new(), ..problem.options.clone() };
+        return fit(method, &Problem { features: Some(&selected), options: &options, ..*problem }, progress);
+    }
     if problem.statistics.latent().is_empty() {
         method.fit(problem, progress)
     } else {

@@ -122,6 +122,9 @@ pub struct FitOptions {
     pub smoothing: f64,
     /// Seed of methods that draw numbers.
     pub seed: u64,
+    /// Names of the features that the basis takes, in this order; empty: all of them. Looked at where the basis is
+    /// [`BasisKind::Features`] alone.
+    pub features: Vec<String>,
 }
 
 impl Default for FitOptions {
@@ -147,6 +150,7 @@ impl Default for FitOptions {
             max_iterations: 1000,
             smoothing: 0.0,
             seed: 0,
+            features: Vec::new(),
         }
     }
 }

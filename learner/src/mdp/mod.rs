@@ -6,6 +6,7 @@
 
 #![expect(clippy::doc_markdown, reason = "formulae in the notation of the papers are not code")]
 
+mod estimate;
 mod evaluation;
 mod features;
 mod linear;
@@ -16,6 +17,7 @@ mod planners;
 mod policy;
 mod tabular;
 
+pub use estimate::{EstimateError, EstimatedMdp, TransitionCounts};
 pub use evaluation::evaluate_policy;
 pub use features::{Features, FeaturesError};
 pub use occupancy::{

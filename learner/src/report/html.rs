@@ -200,6 +200,7 @@ fn groups(report: &Report, pictures: &[Picture]) -> Vec<Value> {
     };
     let mut groups = Vec::new();
     if report.true_reward.is_some() {
+        groups.extend(group("weights", "What it values", "", named(&["features"])));
         groups.extend(group("want", "What it wants", "Learned beside true.", named(&["reward", "true_reward"])));
         groups.extend(group("does", "What it does", "Learned beside optimal.", named(&["policy", "optimal_policy"])));
         groups.extend(group("seen", "What was seen, and what it is worth", "", named(&["visits", "values"])));
@@ -209,6 +210,7 @@ fn groups(report: &Report, pictures: &[Picture]) -> Vec<Value> {
         } else {
             ["policy_table", "reward_table"]
         };
+        groups.extend(group("weights", "What it wants", "", named(&["features"])));
         groups.extend(group("learned", "What was learned", "", named(&pair)));
         groups.extend(group("seen", "What was seen, and what it is worth", "", named(&["visits", "values"])));
     }

@@ -10,6 +10,7 @@ use std::path::Path;
 ///
 /// Keys: `env, style, method, trajectories, horizon, drivers, agreement, states_covered, stopped, iterations, fit_secs,
 /// total_secs, report`; where no driver is rolled out (a maze) `expected_value_difference` stands in place of `drivers`.
+/// A fit of features adds `features`.
 pub fn to_string(report: &Report, path: Option<&Path>) -> String {
     serde_json::to_string(&Summary::new(report, path)).expect("plain structs of numbers and text serialise")
 }
@@ -31,6 +32,18 @@ struct Summary<'a> {
     fit_secs: Finite,
     total_secs: Finite,
     report: Option<String>,
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    features: Vec<FeatureJson<'a>>,
+}
+
+/// A feature's weight, and how much of it there is a step.
+#[derive(Serialize)]
+struct FeatureJson<'a> {
+    name: &'a str,
+    weight: IntervalJson,
+    demonstrated: Finite,
+    learned: Finite,
+    random: Finite,
 }
 
 impl<'a> Summary<'a> {
@@ -54,6 +67,19 @@ impl<'a> Summary<'a> {
             fit_secs: Finite(report.fit_secs),
             total_secs: Finite(report.total_secs),
             report: path.map(|path| path.display().to_string()),
+            features: report.features.iter().map(FeatureJson::new).collect(),
+        }
+    }
+}
+
+impl<'a> FeatureJson<'a> {
+    fn new(row: &'a super::FeatureRow) -> Self {
+        Self {
+            name: &row.name,
+            weight: row.weight.into(),
+            demonstrated: Finite(row.demonstrated),
+            learned: Finite(row.learned),
+            random: Finite(row.random),
         }
     }
 }

@@ -68,6 +68,21 @@ pub struct Source {
     pub trajectories: u64,
 }
 
+/// A feature of the model: its weight, and how much of it there is a step.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct FeatureRow {
+    /// Its name; text of a user.
+    pub name: String,
+    /// Its weight with the 95 % interval, infinite where none is known.
+    pub weight: Interval,
+    /// Mean over the demonstrated steps.
+    pub demonstrated: f64,
+    /// Mean a step that the learned greedy policy meets in the model, over as many steps as the demonstrations have.
+    pub learned: f64,
+    /// The same of uniformly random actions.
+    pub random: f64,
+}
+
 /// Where each state lies on a grid.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct GridLayout {
@@ -164,6 +179,8 @@ pub struct Report {
     pub grid: Option<GridLayout>,
     /// A frame of the environment, driven by the learned policy, as PNG.
     pub frame_png: Option<Vec<u8>>,
+    /// What the fit makes of the model's features; empty where it does not weigh them.
+    pub features: Vec<FeatureRow>,
     /// Commands that repeat this run, one a line as typed.
     pub commands: Vec<String>,
 }

@@ -84,6 +84,7 @@ pub(crate) fn plain(n_states: usize, n_actions: usize) -> Report {
         optimal_policy: None,
         grid: None,
         frame_png: None,
+        features: Vec::new(),
         commands: vec!["learner fit --env Custom-v0 --method em --seed 7".into()],
     }
 }

@@ -70,6 +70,7 @@ pub fn render(report: &Report, terminal: Terminal) -> Result<String, ReportError
     let mut parts = Vec::new();
     parts.extend(drivers(report, terminal));
     parts.push(summary(report, terminal));
+    parts.extend(features(report, terminal));
     parts.push(states(report, terminal));
     if !report.warnings.is_empty() {
         let lines = report
@@ -128,6 +129,45 @@ fn drivers(report: &Report, terminal: Terminal) -> Option<String> {
 /// An expected value difference; what rounding leaves of none is none.
 pub(crate) fn difference_text(difference: f64) -> String {
     if difference.abs() < 1e-9 { "0".to_owned() } else { brief(difference) }
+}
+
+/// Weights of the features, and how much of each there is a step; `None` where the fit does not weigh any.
+fn features(report: &Report, terminal: Terminal) -> Option<String> {
+    if report.features.is_empty() {
+        return None;
+    }
+    let mut table = terminal.table();
+    table.set_header(["feature", "weight", "demonstrated", "learned", "random"].map(head));
+    let column = |of: fn(&super::FeatureRow) -> f64| alike(report.features.iter().map(of));
+    let (weight, means) = (
+        column(|row| row.weight.mean),
+        alike(report.features.iter().flat_map(|r| [r.demonstrated, r.learned, r.random])),
+    );
+    for row in &report.features {
+        let (low, high) = (row.weight.low, row.weight.high);
+        let ends = if low.is_finite() && high.is_finite() {
+            format!(" [{}, {}]", weight(low), weight(high))
+        } else {
+            String::new()
+        };
+        let cells = [
+            clip(&row.name, 40),
+            format!("{}{ends}", weight(row.weight.mean)),
+            means(row.demonstrated),
+            means(row.learned),
+            means(row.random),
+        ];
+        table.add_row(cells.map(Cell::new));
+    }
+    right_align(&mut table, 1..5);
+    Some(format!(
+        "{}{}\n{}",
+        terminal.heading("Features"),
+        terminal.dim(
+            "  weight [95 % interval] and mean a step: demonstrated, of the learned policy in the model, at random"
+        ),
+        table.trim_fmt()
+    ))
 }
 
 /// The fit in a glance, as names and values.

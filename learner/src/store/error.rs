@@ -43,6 +43,16 @@ pub enum StoreError {
         /// Which of the request's trajectories it is.
         index: usize,
     },
+    /// A model of these rows is stored with another header.
+    #[error("model {id} is stored already, for environment {env_id:?}, with other {differs}")]
+    ModelExists {
+        /// The id.
+        id: String,
+        /// Environment of the stored one.
+        env_id: String,
+        /// In what the two differ.
+        differs: String,
+    },
     /// More than one fit begins with this prefix.
     #[error("{matches} fits begin with {prefix:?}")]
     AmbiguousFit {

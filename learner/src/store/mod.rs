@@ -23,7 +23,7 @@ mod tests;
 pub use error::StoreError;
 pub use filter::Filter;
 pub use fits::FitInfo;
-pub use models::{Model, ModelInfo, Rows, check_header};
+pub use models::{Model, ModelInfo, Put, Rows, check_header};
 pub use recording::{
     Arrays, Collection, FieldError, MAX_LABEL_BYTES, Recording, check_label, check_model_id, clip, pack_f64, pack_u32,
     unpack_f64, unpack_u32,
@@ -110,9 +110,13 @@ impl Store {
         self.write(move |connection| trajectories::delete(connection, &filter)).await
     }
 
-    /// Stores a model. `Ok(false)`: it is stored already.
-    pub async fn put_model(&self, model: Model) -> Result<bool, StoreError> {
-        self.write(move |connection| models::insert(connection, &model)).await
+    /// Stores a model; with `replace`, its header takes the place of the one that its rows are stored with.
+    ///
+    /// # Errors
+    /// [`StoreError::ModelExists`] where the rows are stored with another header, which is not to be replaced.
+    pub async fn put_model(&self, model: Model, replace: bool) -> Result<Put, StoreError> {
+        let job = move |work: &mut writer::Work<'_>| models::insert(work.connection, work.path, &model, replace);
+        self.0.writer.queue(job).await?.committed().await
     }
 
     /// Stores a fit, whose id is set, and returns it with the time at which it was stored.

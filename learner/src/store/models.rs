@@ -9,7 +9,7 @@ use super::{
     recording::{FieldError, check_label, clip, unpack_f64, unpack_u32},
 };
 use bytes::Bytes;
-use mazeway_proto::env::ModelHeader;
+use mazeway_proto::env::{FeatureDomain, FeatureTable, ModelHeader};
 use prost::Message as _;
 use rusqlite::{Connection, OptionalExtension, params};
 use sha2::{Digest, Sha256};
@@ -84,7 +84,7 @@ impl Model {
     }
 }
 
-/// Checks sizes, labels, start, rewards and grid.
+/// Checks sizes, labels, start, rewards, grid, features and the range of terminal states.
 pub fn check_header(header: &ModelHeader) -> Result<(), FieldError> {
     let field = |name: &str, message: String| Err(FieldError::new(format!("header.{name}"), message));
     check_label("header.env_id", &header.env_id, false)?;
@@ -144,6 +144,50 @@ pub fn check_header(header: &ModelHeader) -> Result<(), FieldError> {
             return field("grid.cells", format!("expected cells below {cells}, got {}", cell as i32));
         }
     }
+    if let Some(table) = &header.features {
+        check_features(table, n_states, n_actions)?;
+    }
+    let terminal = &header.terminal_states;
+    if !terminal.len().is_multiple_of(4) {
+        return field("terminal_states", format!("expected 4 bytes a state, got {} bytes", terminal.len()));
+    }
+    let mut before = None;
+    for state in unpack_u32(terminal) {
+        if state >= header.n_states || before.is_some_and(|before| before >= state) {
+            let message = format!("expected rising states below {n_states}, got {}", state as i32);
+            return field("terminal_states", message);
+        }
+        before = Some(state);
+    }
+    Ok(())
+}
+
+fn check_features(table: &FeatureTable, n_states: usize, n_actions: usize) -> Result<(), FieldError> {
+    let field = |name: &str, message: String| Err(FieldError::new(format!("header.features.{name}"), message));
+    if table.names.is_empty() {
+        return field("names", "expected at least one feature, got none".into());
+    }
+    for (i, name) in table.names.iter().enumerate() {
+        check_label(&format!("header.features.names[{i}]"), name, false)?;
+        if table.names[..i].contains(name) {
+            return field(&format!("names[{i}]"), format!("expected each feature once, got {:?} again", clip(name)));
+        }
+    }
+    let rows = match FeatureDomain::try_from(table.domain) {
+        Ok(FeatureDomain::State) => n_states,
+        Ok(FeatureDomain::StateAction) => n_states * n_actions,
+        Ok(FeatureDomain::Unspecified) | Err(_) => {
+            return field("domain", format!("expected states or state-action pairs, got {}", table.domain));
+        }
+    };
+    let expected = rows.saturating_mul(table.names.len()).saturating_mul(8);
+    if table.values.len() != expected {
+        return field("values", format!("expected {expected} bytes, got {}", table.values.len()));
+    }
+    if let Some((entry, value)) = unpack_f64(&table.values).enumerate().find(|(_, value)| !value.is_finite()) {
+        let (row, name) = (entry / table.names.len(), &table.names[entry % table.names.len()]);
+        return field("values", format!("expected finite features, got {value} for {:?} in row {row}", clip(name)));
+    }
     Ok(())
 }
 
@@ -166,6 +210,7 @@ fn check_rows(header: &ModelHeader, rows: &Rows) -> Result<(), FieldError> {
     }
     let mut next_states = unpack_u32(&rows.next_states);
     let mut probabilities = unpack_f64(&rows.probabilities);
+    let mut terminal = unpack_u32(&header.terminal_states).peekable();
     for (row, length) in unpack_u32(&rows.row_lengths).enumerate() {
         let at = || format!("at state {}, action {}", row / header.n_actions as usize, row % header.n_actions as usize);
         let (mut before, mut sum) = (None, 0.0);
@@ -185,6 +230,15 @@ fn check_rows(header: &ModelHeader, rows: &Rows) -> Result<(), FieldError> {
         }
         if (sum - 1.0).abs() > ROW_SUM_TOLERANCE {
             return field("probabilities", format!("expected a sum of 1, got {sum} {}", at()));
+        }
+        let state = (row / header.n_actions as usize) as u32;
+        if terminal.peek() == Some(&state) {
+            if length != 1 || before != Some(state) {
+                return field("next_states", format!("expected a terminal state to lead to itself alone {}", at()));
+            }
+            if row % header.n_actions as usize + 1 == header.n_actions as usize {
+                terminal.next();
+            }
         }
     }
     Ok(())
@@ -216,14 +270,49 @@ fn model_id(header: &ModelHeader, rows: &Rows) -> String {
     hexadecimal
 }
 
-/// Stores a model. `Ok(false)`: it is stored already.
-pub(super) fn insert(connection: &Connection, model: &Model) -> rusqlite::Result<bool> {
+/// What became of a model that was to be stored.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Put {
+    /// It is new.
+    Stored,
+    /// It was there, header and all.
+    Known,
+    /// Its rows were there; its header took the place of theirs.
+    Replaced,
+}
+
+/// Stores a model. Its rows are its identity: where they are there with another header, that is an error unless it is to
+/// be replaced.
+pub(super) fn insert(connection: &Connection, path: &Path, model: &Model, replace: bool) -> Result<Put, StoreError> {
+    let fail = |e: rusqlite::Error| StoreError::from_sqlite(path, &e);
     let Model { header, rows } = model;
     let mut document = vec![DOCUMENT_VERSION];
     document.extend(header.encode_to_vec());
-    let inserted = connection.execute(
+    let known = connection
+        .query_row("SELECT header FROM models WHERE model_id = ?", [&header.model_id], |row| row.get::<_, Vec<u8>>(0))
+        .optional()
+        .map_err(fail)?;
+    if let Some(known) = known {
+        let known = decode_header(known.into(), &header.model_id)?;
+        if known == *header {
+            return Ok(Put::Known);
+        }
+        if !replace {
+            return Err(StoreError::ModelExists {
+                id: header.model_id.clone(),
+                env_id: known.env_id.clone(),
+                differs: differing(&known, header),
+            });
+        }
+        let values = params![header.env_id, document, rows.visit_counts.as_ref(), header.model_id];
+        connection
+            .execute("UPDATE models SET env_id = ?, header = ?, visit_counts = ? WHERE model_id = ?", values)
+            .map_err(fail)?;
+        return Ok(Put::Replaced);
+    }
+    let insert = connection.execute(
         "INSERT INTO models (model_id, env_id, stored_at, n_transitions, header, row_lengths, next_states, \
-         probabilities, visit_counts) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?) ON CONFLICT (model_id) DO NOTHING",
+         probabilities, visit_counts) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
         params![
             header.model_id,
             header.env_id,
@@ -235,8 +324,24 @@ pub(super) fn insert(connection: &Connection, model: &Model) -> rusqlite::Result
             rows.probabilities.as_ref(),
             rows.visit_counts.as_ref(),
         ],
-    )?;
-    Ok(inserted == 1)
+    );
+    insert.map_err(fail)?;
+    Ok(Put::Stored)
+}
+
+/// In what two headers of the same rows differ.
+fn differing(known: &ModelHeader, new: &ModelHeader) -> String {
+    let parts = [
+        ("environment", known.env_id != new.env_id),
+        ("labels", known.state_labels != new.state_labels || known.action_labels != new.action_labels),
+        ("start distribution", known.initial_distribution != new.initial_distribution),
+        ("rewards", known.rewards != new.rewards),
+        ("features", known.features != new.features),
+        ("terminal states", known.terminal_states != new.terminal_states),
+        ("origin", known.estimated != new.estimated),
+        ("grid", known.grid != new.grid),
+    ];
+    parts.into_iter().filter(|part| part.1).map(|part| part.0).collect::<Vec<_>>().join(", ")
 }
 
 /// Reads a model.

@@ -241,5 +241,7 @@ fn model_header(model: &TabularModel) -> pb::ModelHeader {
             columns: *columns,
             cells: pack_u32(cells),
         }),
+        features: None,
+        terminal_states: Bytes::new(),
     }
 }

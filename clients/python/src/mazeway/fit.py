@@ -224,8 +224,11 @@ def options_to_wire(options: dict[str, Any]) -> Any:
         elif isinstance(value, np.generic):
             value = value.item()
         try:
-            setattr(message, name, value)
-        except (TypeError, ValueError) as error:
+            if isinstance(value, (list, tuple)):
+                getattr(message, name).extend(value)
+            else:
+                setattr(message, name, value)
+        except (AttributeError, TypeError, ValueError) as error:
             raise InvalidArgumentError(f"{name}: {error}", field=name) from None
     return message
 
@@ -235,6 +238,8 @@ def _options_from_wire(message: Any) -> dict[str, Any]:
         field.name: (
             _wire.enum_name(getattr(_wire.learner, _ENUMS[field.name][0]), _ENUMS[field.name][1], value)
             if field.name in _ENUMS
+            else list(value)
+            if field.name == "features"
             else value
         )
         for field, value in message.ListFields()

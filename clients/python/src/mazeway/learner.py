@@ -76,7 +76,8 @@ class Learner:
             progress: Called after each iteration.
             timeout_secs: Longest time for the whole fit.
             **options: discount, horizon, horizon_prior ("geometric", "uniform"), basis ("state",
-                "state-action"), m_step ("nnls", "simplex"), responsibility ("approximate", "exact"),
+                "state-action", "features"), features (names), m_step ("nnls", "simplex"),
+                responsibility ("approximate", "exact"),
                 planner ("value-iteration", "policy-iteration", "soft-value-iteration",
                 "expectation-maximization"), reference_basis, penalty ("l1", "l2", "none"),
                 penalty_strength, tolerance, max_iterations, smoothing, seed.

@@ -64,6 +64,8 @@ fn a_large_model_travels_in_blocks() {
         visit_counts: None,
         rewards: Vec::new(),
         grid: None,
+        features: None,
+        terminal_states: Vec::new(),
         ..model()
     };
     large.model_id = large.compute_id();
@@ -89,6 +91,8 @@ fn a_row_longer_than_a_block_travels_alone() {
         visit_counts: None,
         rewards: Vec::new(),
         grid: None,
+        features: None,
+        terminal_states: Vec::new(),
         ..model()
     };
     wide.model_id = wide.compute_id();

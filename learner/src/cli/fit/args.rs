@@ -41,6 +41,14 @@ pub struct FitArgs {
     #[arg(long = "env-option", value_name = "KEY=VALUE")]
     pub env_options: Vec<String>,
 
+    /// Model of an environment that was imported: the beginning of its id, or "estimate" from the recordings
+    /// [default: the one that was stored last]
+    #[arg(long, value_name = "ID|estimate")]
+    pub model: Option<String>,
+    /// With --model estimate: how many transitions the prior of each state-action pair is worth
+    #[arg(long, value_name = "COUNT", default_value_t = 1.0)]
+    pub model_prior: f64,
+
     /// How to learn
     #[command(flatten)]
     pub learning: LearningArgs,

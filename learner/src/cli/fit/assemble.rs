@@ -7,7 +7,7 @@ use mazeway_learner::{
     eval,
     irl::{self, TraceEntry},
     mdp::{Policy, TabularMdp},
-    report::{GridLayout, Report, Source},
+    report::{FeatureRow, GridLayout, Report, Source},
 };
 use mazeway_proto::learner as pb;
 use prost::bytes::Bytes;
@@ -84,8 +84,10 @@ pub struct Parts<'a> {
     pub learned: Learned,
     /// Roll-outs.
     pub judged: Judged,
-    /// A picture of the environment.
-    pub frame: Vec<u8>,
+    /// A picture of the environment, where it can be drawn.
+    pub frame: Option<Vec<u8>>,
+    /// What the fit makes of the features, where it weighs them.
+    pub features: Vec<FeatureRow>,
     /// Where the recordings came from.
     pub sources: Vec<Source>,
     /// When the run began.
@@ -97,7 +99,7 @@ pub struct Parts<'a> {
 /// # Errors
 /// A fit that the service describes wrongly.
 pub fn report(parts: Parts<'_>) -> Result<Report, CliError> {
-    let Parts { job, style, model, mdp, truth, fit, learned, judged, frame, sources, begun } = parts;
+    let Parts { job, style, model, mdp, truth, fit, learned, judged, frame, features, sources, begun } = parts;
     let n_actions = model.n_actions as usize;
     let wrong = |error: &dyn std::fmt::Display| {
         CliError::failure(
@@ -156,12 +158,13 @@ pub fn report(parts: Parts<'_>) -> Result<Report, CliError> {
         log_likelihood_per_step: fit.log_likelihood_per_step,
         log_likelihood_per_step_held_out: judged.log_likelihood_per_step,
         drivers: judged.drivers,
-        evaluation: Some(judged.evaluation),
+        evaluation: judged.evaluation,
         expected_value_difference: difference,
         true_reward,
         optimal_policy,
         grid: model.grid.map(|grid| GridLayout { rows: grid.rows, columns: grid.columns, cells: grid.cells }),
-        frame_png: Some(frame),
+        frame_png: frame,
+        features,
         commands: vec![command(std::env::args().skip(1))],
     })
 }

@@ -28,8 +28,13 @@ pub struct Judged {
     pub agreement: Option<f64>,
     /// Mean log π(a|s) of the same steps.
     pub log_likelihood_per_step: Option<f64>,
-    /// The roll-outs behind these numbers.
-    pub evaluation: Evaluation,
+    /// The roll-outs behind these numbers, where there were any.
+    pub evaluation: Option<Evaluation>,
+}
+
+impl Judged {
+    /// Nothing was rolled out.
+    pub const NONE: Self = Self { drivers: None, agreement: None, log_likelihood_per_step: None, evaluation: None };
 }
 
 /// Summed info columns that describe a driver.
@@ -82,7 +87,7 @@ pub async fn judge(
         drivers,
         agreement: seen.as_ref().map(|counts| eval::step_agreement(policies.greedy, counts)),
         log_likelihood_per_step: seen.as_ref().map(|counts| eval::log_likelihood_per_step(policies.stochastic, counts)),
-        evaluation,
+        evaluation: Some(evaluation),
     })
 }
 

@@ -45,6 +45,37 @@ pub struct Job {
     pub seed: u32,
     /// Episodes of a roll-out.
     pub rollouts: u32,
+    /// Model of an imported environment, where given.
+    pub model: Option<AskedModel>,
+}
+
+/// Which model of an imported environment.
+#[derive(Debug, Clone, PartialEq)]
+pub enum AskedModel {
+    /// The one whose id begins so.
+    Id(String),
+    /// One that is estimated from the recordings, with a prior that is worth so many transitions.
+    Estimate(f64),
+}
+
+fn asked_model(args: &FitArgs) -> Result<Option<AskedModel>, CliError> {
+    match args.model.as_deref() {
+        None => Ok(None),
+        Some("estimate") if args.model_prior.is_finite() && args.model_prior >= 0.0 => {
+            Ok(Some(AskedModel::Estimate(args.model_prior)))
+        }
+        Some("estimate") => Err(CliError::usage(
+            format!("expected --model-prior to be a number of at least 0, got {}", args.model_prior),
+            "leave it out for a prior that is worth one transition",
+        )),
+        Some(id) if !id.is_empty() && id.len() <= 64 && id.bytes().all(|b| b.is_ascii_hexdigit()) => {
+            Ok(Some(AskedModel::Id(id.to_ascii_lowercase())))
+        }
+        Some(id) => Err(CliError::usage(
+            format!("expected the beginning of a model's id or 'estimate' for --model, got '{id}'"),
+            "see the models with 'learner list --models'",
+        )),
+    }
 }
 
 /// Default number of trajectories and steps of each.
@@ -88,6 +119,7 @@ impl Job {
             basis: args.learning.basis(),
             seed: args.seed,
             rollouts: args.rollouts,
+            model: asked_model(args)?,
         })
     }
 }

@@ -5,6 +5,9 @@ use clap::{Args, ValueEnum};
 use mazeway_learner::irl;
 use mazeway_proto::learner::{self as pb, FitOptions};
 
+/// The word of --features that means every one.
+const ALL_FEATURES: &str = "all";
+
 /// The default method's id.
 pub fn default_method() -> &'static str {
     irl::METHODS[0].id()
@@ -49,6 +52,8 @@ pub enum BasisArg {
     State,
     /// One function a state-action pair
     StateAction,
+    /// The features of the model
+    Features,
 }
 
 /// Reward step of `em`.
@@ -170,6 +175,9 @@ pub struct LearningArgs {
     /// Draws that each chain keeps [default: the method's own]
     #[arg(long, value_name = "N", help_heading = "Learning", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
     pub draws: Option<u32>,
+    /// Take these features of the model for the basis of the reward, as in x,y; "all" takes every one
+    #[arg(long, value_name = "NAMES", value_delimiter = ',', help_heading = "Learning")]
+    pub features: Vec<String>,
     /// Draws that each chain makes first and forgets [default: the method's own]
     #[arg(long, value_name = "N", help_heading = "Learning", value_parser = clap::value_parser!(u32).range(..=1_000_000))]
     pub warm_up: Option<u32>,
@@ -185,6 +193,18 @@ impl LearningArgs {
             return Err(CliError::usage(
                 format!("expected --discount in [0, 1), got {}", self.discount),
                 "a discount close to 1, such as 0.99, looks far ahead",
+            ));
+        }
+        if !self.features.is_empty() && self.basis.is_some_and(|basis| basis != BasisArg::Features) {
+            return Err(CliError::usage(
+                "expected --features without another --basis, got both",
+                "the features are the basis: leave out --basis",
+            ));
+        }
+        if self.features.iter().any(String::is_empty) {
+            return Err(CliError::usage(
+                "expected names of features between the commas of --features, got an empty one",
+                "such as --features speed,gap or --features all",
             ));
         }
         for (flag, value) in [
@@ -205,9 +225,11 @@ impl LearningArgs {
 
     /// Basis, where given.
     pub fn basis(&self) -> Option<pb::Basis> {
-        self.basis.map(|basis| match basis {
+        let features = (!self.features.is_empty()).then_some(BasisArg::Features);
+        self.basis.or(features).map(|basis| match basis {
             BasisArg::State => pb::Basis::State,
             BasisArg::StateAction => pb::Basis::StateAction,
+            BasisArg::Features => pb::Basis::Features,
         })
     }
 
@@ -272,6 +294,7 @@ impl LearningArgs {
             chains: args.chains,
             draws: args.draws,
             warm_up: args.warm_up,
+            features: self.features.iter().filter(|name| *name != ALL_FEATURES).cloned().collect(),
         }
     }
 }

@@ -6,6 +6,7 @@
 mod args;
 pub mod assemble;
 mod evaluate;
+mod imported;
 pub mod job;
 pub mod learning;
 pub mod narrate;
@@ -52,7 +53,16 @@ pub async fn run(args: FitArgs) -> Result<(), CliError> {
 
 async fn fit(args: &FitArgs, job: &Job, services: &Services, narrator: Narrator) -> Result<(), CliError> {
     let begun = Instant::now();
-    let spec = services.spec(&job.env_id).await?;
+    let spec = match (&job.model, services.spec(&job.env_id).await) {
+        (None, Ok(spec)) => spec,
+        (Some(_), _) => return imported::fit(args, job, services, narrator, begun).await,
+        (None, Err(error)) => {
+            if services.imported(&job.env_id).await? {
+                return imported::fit(args, job, services, narrator, begun).await;
+            }
+            return Err(error);
+        }
+    };
     let style = match &job.style {
         Some(style) => style.clone(),
         None => spec.styles.first().cloned().unwrap_or_default(),
@@ -77,10 +87,10 @@ async fn fit(args: &FitArgs, job: &Job, services: &Services, narrator: Narrator)
     let policies =
         Policies { greedy: &learned.greedy_policy, stochastic: &learned.policy, n_actions: model.n_actions as usize };
     let judged = evaluate::judge(job, &spec, policies, expert.as_ref(), services, narrator).await?;
-    narrator.step(
-        "judged",
-        format_args!("{} episodes of up to {} steps a driver", judged.evaluation.episodes, judged.evaluation.steps),
-    )?;
+    if let Some(evaluation) = judged.evaluation {
+        let (episodes, steps) = (evaluation.episodes, evaluation.steps);
+        narrator.step("judged", format_args!("{episodes} episodes of up to {steps} steps a driver"))?;
+    }
     let frame = evaluate::frame(job, &learned.greedy_policy, policies.n_actions, services).await?;
     let sources = services.sources(&recordings).await?;
 
@@ -97,7 +107,8 @@ async fn fit(args: &FitArgs, job: &Job, services: &Services, narrator: Narrator)
         fit,
         learned,
         judged,
-        frame,
+        frame: Some(frame),
+        features: Vec::new(),
         sources,
         begun,
     })?;
@@ -113,7 +124,7 @@ async fn learn(
     narrator: Narrator,
 ) -> Result<mazeway_proto::learner::Fit, CliError> {
     let basis = job.basis.unwrap_or_else(|| job::default_basis(&job.env_id));
-    let mut options = job.options;
+    let mut options = job.options.clone();
     options.horizon = recordings.horizon;
     options.basis = basis.into();
     let request = FitRequest {

@@ -8,7 +8,7 @@ use crate::cli::{
     error::CliError,
     scene,
 };
-use mazeway_client::{Connection, Env, EnvSpec, Episodes, Learner, Model, Rollout, SessionOptions};
+use mazeway_client::{Code, Connection, Env, EnvSpec, Episodes, Learner, Model, Rollout, SessionOptions};
 use mazeway_learner::report::Source;
 use mazeway_proto::learner::{Fit, FitProgress, FitRequest, Trajectory, TrajectoryFilter};
 use std::{
@@ -21,7 +21,8 @@ const ENVIRONMENTS_PORT: u16 = 50051;
 
 /// Connections, and the guards of what was started for them.
 pub struct Services {
-    environments: Connection,
+    /// Why there is none, where there is none.
+    environments: Result<Connection, CliError>,
     learner: Learner,
     data: PathBuf,
     embedded: Vec<Embedded>,
@@ -58,17 +59,16 @@ impl Services {
         let learner = Learner::connect(&learner_address).await.map_err(|error| {
             CliError::failure(error.to_string(), format!("start one with 'learner serve --listen {learner_address}'"))
         })?;
+        // An imported environment needs none: it is an error only once it is asked for.
         let environments = Connection::open(&environments_address).await.map_err(|error| {
             CliError::failure(
                 error.to_string(),
                 format!("start one with 'server --listen {environments_address}', or name another with --env-addr"),
             )
-        })?;
+        });
         if args.store.addr.is_some() {
-            narrator.step(
-                "connected",
-                format_args!("learner at {learner_address}, environments at {environments_address}"),
-            )?;
+            let there = if environments.is_ok() { &environments_address } else { "nowhere" };
+            narrator.step("connected", format_args!("learner at {learner_address}, environments at {there}"))?;
         }
         Ok(Self { environments, learner, data, embedded: running })
     }
@@ -85,6 +85,23 @@ impl Services {
         Ok(())
     }
 
+    fn environments(&self) -> Result<&Connection, CliError> {
+        self.environments.as_ref().map_err(Clone::clone)
+    }
+
+    /// The learner.
+    pub fn learner(&self) -> &Learner {
+        &self.learner
+    }
+
+    /// Whether the learner knows a model of the environment.
+    ///
+    /// # Errors
+    /// The learner fails.
+    pub async fn imported(&self, env_id: &str) -> Result<bool, CliError> {
+        Ok(!self.learner.list_models(env_id).await?.is_empty())
+    }
+
     /// Directory of reports.
     pub fn data(&self) -> &Path {
         &self.data
@@ -95,7 +112,7 @@ impl Services {
     /// # Errors
     /// There is none of that name.
     pub async fn spec(&self, env_id: &str) -> Result<EnvSpec, CliError> {
-        scene::spec(&self.environments, env_id).await
+        scene::spec(self.environments()?, env_id).await
     }
 
     /// The environment's tabular model.
@@ -103,7 +120,7 @@ impl Services {
     /// # Errors
     /// Wrong options; the server fails.
     pub async fn model(&self, job: &Job, spec: &EnvSpec) -> Result<Model, CliError> {
-        scene::model(&self.environments, spec, &job.env_options).await
+        scene::model(self.environments()?, spec, &job.env_options).await
     }
 
     /// Keeps a model in the learner.
@@ -111,8 +128,11 @@ impl Services {
     /// # Errors
     /// The learner refuses it.
     pub async fn put_model(&self, model: &Model) -> Result<(), CliError> {
-        self.learner.put_model(model).await?;
-        Ok(())
+        match self.learner.put_model(model).await {
+            // Somebody described the same process in another way, with features perhaps: that stays.
+            Err(error) if error.code() == Code::AlreadyExists => Ok(()),
+            outcome => Ok(outcome.map(|_| ())?),
+        }
     }
 
     /// Has the server drive; tells of episodes as they come.
@@ -120,7 +140,7 @@ impl Services {
     /// # Errors
     /// The server refuses or fails.
     pub async fn rollout(&self, rollout: Rollout, mut arrived: impl FnMut(u64)) -> Result<Episodes, CliError> {
-        let stream = self.environments.rollout_stream(rollout).await?;
+        let stream = self.environments()?.rollout_stream(rollout).await?;
         Ok(stream.collect_with(|episodes| arrived(episodes.len() as u64)).await?)
     }
 
@@ -129,7 +149,7 @@ impl Services {
     /// # Errors
     /// The server refuses.
     pub async fn env(&self, env_id: &str, options: SessionOptions) -> Result<Env, CliError> {
-        Ok(Env::create(&self.environments, env_id, options).await?)
+        Ok(Env::create(self.environments()?, env_id, options).await?)
     }
 
     /// How many recordings a filter selects.

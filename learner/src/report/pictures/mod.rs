@@ -6,6 +6,7 @@
 mod bands;
 mod canvas;
 mod colour;
+mod features;
 mod finite;
 mod grid;
 mod highway;
@@ -58,6 +59,7 @@ pub fn all(report: &Report) -> Result<Vec<Picture>, ReportError> {
     if report.grid.is_none() {
         pictures.extend(finite::pictures(report, !report.is_highway())?);
     }
+    pictures.extend(features::picture(report)?);
     pictures.extend(trace::picture(report)?);
     Ok(pictures)
 }

@@ -1,0 +1,230 @@
+//! Parquet, a row at a time, from the columns of simple types that it has.
+//!
+//! Columns are read in batches by the low-level readers: the record interface of the library panics on types that it does
+//! not know. Columns of other types (lists, structs, times of 96 bits) are left out, as if they were not there.
+
+use super::{
+    error::{FileError, Place},
+    table::Table,
+    value::Value,
+};
+use parquet::{
+    basic::{ConvertedType, Type as PhysicalType},
+    column::reader::{ColumnReader, ColumnReaderImpl},
+    data_type::DataType,
+    errors::ParquetError,
+    file::reader::{FileReader, SerializedFileReader},
+};
+use std::{
+    collections::VecDeque,
+    fs::File,
+    panic::{AssertUnwindSafe, catch_unwind},
+    path::{Path, PathBuf},
+};
+
+/// Rows that are read at a time.
+const BATCH: usize = 4096;
+const HINT: &str = "write it again with pandas, polars or DuckDB, compressed with snappy, zstd or not at all";
+
+/// Columns of a Parquet file.
+pub struct ParquetTable {
+    file: PathBuf,
+    reader: SerializedFileReader<File>,
+    columns: Vec<String>,
+    /// Rank of each column among the leaves of the file.
+    leaves: Vec<usize>,
+    /// Whether a column's integers have no sign.
+    unsigned: Vec<bool>,
+    /// Row groups that are not begun.
+    groups: std::ops::Range<usize>,
+    /// The group that is being read.
+    open: Vec<ColumnReader>,
+    left: usize,
+    batches: Vec<VecDeque<Value>>,
+    row: u64,
+}
+
+impl std::fmt::Debug for ParquetTable {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("ParquetTable").field("file", &self.file).field("row", &self.row).finish_non_exhaustive()
+    }
+}
+
+/// Runs code of the library, which panics on some broken files.
+fn guarded<T>(file: &Path, place: &Place, work: impl FnOnce() -> Result<T, ParquetError>) -> Result<T, FileError> {
+    let outcome = catch_unwind(AssertUnwindSafe(work));
+    let message = match outcome {
+        Ok(Ok(value)) => return Ok(value),
+        Ok(Err(error)) => error.to_string(),
+        Err(_) => "its pages are damaged".to_owned(),
+    };
+    let message = format!("expected a Parquet file: {}", message.trim_start_matches("Parquet error: "));
+    Err(FileError::new(file, place.clone(), message, HINT))
+}
+
+impl ParquetTable {
+    /// Opens a file and reads its schema.
+    ///
+    /// # Errors
+    /// It cannot be read, or is none.
+    pub fn open(file: &Path) -> Result<Self, FileError> {
+        let opened = File::open(file).map_err(|error| FileError::unreadable(file, &error))?;
+        let reader = guarded(file, &Place::File, || SerializedFileReader::new(opened))?;
+        let schema = reader.metadata().file_metadata().schema_descr_ptr();
+        let (mut columns, mut leaves, mut unsigned) = (Vec::new(), Vec::new(), Vec::new());
+        for leaf in 0..schema.num_columns() {
+            let column = schema.column(leaf);
+            let simple = matches!(
+                column.physical_type(),
+                PhysicalType::BOOLEAN
+                    | PhysicalType::INT32
+                    | PhysicalType::INT64
+                    | PhysicalType::FLOAT
+                    | PhysicalType::DOUBLE
+                    | PhysicalType::BYTE_ARRAY
+            ) && column.converted_type() != ConvertedType::DECIMAL;
+            if simple && column.path().parts().len() == 1 && column.max_rep_level() == 0 && column.max_def_level() <= 1
+            {
+                columns.push(column.name().to_owned());
+                leaves.push(leaf);
+                unsigned.push(column.converted_type() == ConvertedType::UINT_64);
+            }
+        }
+        if columns.is_empty() {
+            return Err(FileError::new(file, Place::File, "expected columns of numbers or texts, got none", HINT));
+        }
+        let groups = 0..reader.num_row_groups();
+        let batches = vec![VecDeque::new(); columns.len()];
+        Ok(Self {
+            file: file.to_owned(),
+            reader,
+            columns,
+            leaves,
+            unsigned,
+            groups,
+            open: Vec::new(),
+            left: 0,
+            batches,
+            row: 0,
+        })
+    }
+
+    /// Fills the batches; false at the end of the file.
+    fn fill(&mut self) -> Result<bool, FileError> {
+        let place = Place::Row(self.row + 1);
+        while self.left == 0 {
+            let Some(group) = self.groups.next() else { return Ok(false) };
+            let (reader, leaves) = (&self.reader, &self.leaves);
+            (self.open, self.left) = guarded(&self.file, &place, || {
+                let group = reader.get_row_group(group)?;
+                let rows = usize::try_from(group.metadata().num_rows()).unwrap_or(0);
+                let columns = leaves.iter().map(|&leaf| group.get_column_reader(leaf)).collect::<Result<_, _>>()?;
+                Ok((columns, rows))
+            })?;
+        }
+        let wanted = self.left.min(BATCH);
+        for ((reader, batch), &unsigned) in self.open.iter_mut().zip(&mut self.batches).zip(&self.unsigned) {
+            guarded(&self.file, &place, || read_batch(reader, wanted, unsigned, batch))?;
+            if batch.len() != wanted {
+                let message = format!("expected {wanted} values in every column, got {}", batch.len());
+                return Err(FileError::new(&self.file, place, message, HINT));
+            }
+        }
+        self.left -= wanted;
+        Ok(true)
+    }
+}
+
+impl Table for ParquetTable {
+    fn columns(&self) -> &[String] {
+        &self.columns
+    }
+
+    fn next(&mut self, row: &mut Vec<Value>) -> Result<bool, FileError> {
+        if self.batches[0].is_empty() && !self.fill()? {
+            return Ok(false);
+        }
+        self.row += 1;
+        row.clear();
+        row.extend(self.batches.iter_mut().map(|batch| batch.pop_front().unwrap_or(Value::Null)));
+        Ok(true)
+    }
+
+    fn place(&self, column: Option<usize>) -> Place {
+        match column.and_then(|column| self.columns.get(column)) {
+            None => Place::Row(self.row),
+            Some(name) => Place::Cell { row: self.row, name: name.clone() },
+        }
+    }
+
+    fn file(&self) -> &Path {
+        &self.file
+    }
+}
+
+fn read_batch(
+    reader: &mut ColumnReader,
+    rows: usize,
+    unsigned: bool,
+    out: &mut VecDeque<Value>,
+) -> Result<(), ParquetError> {
+    match reader {
+        ColumnReader::BoolColumnReader(reader) => typed(reader, rows, out, |value| Ok(Value::Truth(*value))),
+        ColumnReader::Int32ColumnReader(reader) => {
+            typed(reader, rows, out, |value| Ok(Value::Integer((*value).into())))
+        }
+        ColumnReader::Int64ColumnReader(reader) => typed(reader, rows, out, |value| {
+            Ok(if unsigned && *value < 0 {
+                Value::Text(value.cast_unsigned().to_string())
+            } else {
+                Value::Integer(*value)
+            })
+        }),
+        ColumnReader::FloatColumnReader(reader) => typed(reader, rows, out, |value| Ok(number((*value).into()))),
+        ColumnReader::DoubleColumnReader(reader) => typed(reader, rows, out, |value| Ok(number(*value))),
+        ColumnReader::ByteArrayColumnReader(reader) => typed(reader, rows, out, |value| {
+            let text = std::str::from_utf8(value.data())
+                .map_err(|_| ParquetError::General("expected text in UTF-8, got other bytes".into()))?;
+            Ok(Value::text(text.trim()))
+        }),
+        ColumnReader::Int96ColumnReader(_) | ColumnReader::FixedLenByteArrayColumnReader(_) => {
+            Err(ParquetError::General("expected a column of numbers or texts".into()))
+        }
+    }
+}
+
+/// A number; pandas writes a missing one as NaN.
+fn number(value: f64) -> Value {
+    if value.is_nan() { Value::Null } else { Value::Number(value) }
+}
+
+fn typed<T: DataType>(
+    reader: &mut ColumnReaderImpl<T>,
+    rows: usize,
+    out: &mut VecDeque<Value>,
+    convert: impl Fn(&T::T) -> Result<Value, ParquetError>,
+) -> Result<(), ParquetError> {
+    let (mut levels, mut values) = (Vec::new(), Vec::new());
+    while out.len() < rows {
+        levels.clear();
+        values.clear();
+        let (records, _, _) = reader.read_records(rows - out.len(), Some(&mut levels), None, &mut values)?;
+        if records == 0 {
+            return Ok(());
+        }
+        if levels.is_empty() {
+            for value in &values {
+                out.push_back(convert(value)?);
+            }
+        } else {
+            let mut values = values.iter();
+            for level in &levels {
+                out.push_back(match (*level > 0).then(|| values.next()).flatten() {
+                    Some(value) => convert(value)?,
+                    None => Value::Null,
+                });
+            }
+        }
+    }
+    Ok(())
+}

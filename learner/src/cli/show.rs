@@ -235,7 +235,8 @@ fn fit_text(fit: &pb::Fit, names: &(Names, Names)) -> Result<String, CliError> {
         [names.0.name(state as u32), visits, value, actions, format!("{gain:.4}"), format!("{likely:.3}")]
     });
     text.push('\n');
-    text.push_str(&table(["#state", "#visits", "#value", "greedy action", "#its reward", "#its probability"], rows));
+    let state = if names.0.labels().is_empty() { "#state" } else { "state" };
+    text.push_str(&table([state, "#visits", "#value", "greedy action", "#its reward", "#its probability"], rows));
     text.push('\n');
     text.push_str(&rest(s));
     Ok(text)

@@ -55,6 +55,10 @@ fn guarded<T>(file: &Path, place: &Place, work: impl FnOnce() -> Result<T, Parqu
     let outcome = catch_unwind(AssertUnwindSafe(work));
     let message = match outcome {
         Ok(Ok(value)) => return Ok(value),
+        Ok(Err(error)) if error.to_string().contains("Disabled feature") => {
+            let message = "expected a file compressed with snappy, zstd or not at all, got another compression";
+            return Err(FileError::new(file, place.clone(), message, HINT));
+        }
         Ok(Err(error)) => error.to_string(),
         Err(_) => "its pages are damaged".to_owned(),
     };

@@ -261,6 +261,14 @@ impl<'a> Gathering<'a> {
             self.first.style.clear();
         }
         let corrupt = |e: &dyn std::fmt::Display| CallError::Internal(format!("trajectory {}: {e}", recording.id()));
+        let arrays = recording.arrays();
+        let counts_alone = self.demonstrations.is_none() && arrays.states.len() == arrays.actions.len();
+        if let (true, Some(builder)) = (counts_alone, &mut self.builder) {
+            // as they are stored: nothing is unpacked or kept
+            builder.add_packed(&arrays.states, &arrays.actions).map_err(|e| corrupt(&e))?;
+            self.trajectory_ids.push(recording.id().to_string());
+            return Ok(());
+        }
         let trajectory = recording.trajectory().map_err(|e| corrupt(&e))?;
         if let Some(builder) = &mut self.builder {
             builder.add(&trajectory).map_err(|e| corrupt(&e))?;

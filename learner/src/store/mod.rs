@@ -164,7 +164,8 @@ impl Store {
         next_page(&*self.reader()?, self.path(), cursor)
     }
 
-    /// Calls `visit` with every trajectory that the filter selects, all as they stand at the first. Blocks.
+    /// Calls `visit` with every trajectory that the filter selects, without its rewards (no method learns from them), all as
+    /// they stand at the first. Blocks.
     pub fn for_each<B>(
         &self,
         filter: &Filter,
@@ -173,7 +174,7 @@ impl Store {
         let reader = self.reader()?;
         let fail = |e: rusqlite::Error| StoreError::from_sqlite(self.path(), &e);
         let snapshot = reader.unchecked_transaction().map_err(fail)?;
-        let mut cursor = Cursor::new(&snapshot, filter).map_err(fail)?;
+        let mut cursor = Cursor::new(&snapshot, filter).map_err(fail)?.without_rewards();
         loop {
             let page = next_page(&snapshot, self.path(), &mut cursor)?;
             if page.is_empty() {

@@ -10,9 +10,8 @@ use rusqlite::{Connection, OptionalExtension, Row, params, params_from_iter, typ
 use std::{collections::HashMap, path::Path};
 use uuid::Uuid;
 
-/// What [`Cursor::page`] reads of a row.
-const COLUMNS: &str =
-    "seq, trajectory_id, collection, seed, final_state, terminated, truncated, states, actions, rewards";
+/// What [`Cursor::page`] reads of a row, the rewards last.
+const COLUMNS: &str = "seq, trajectory_id, collection, seed, final_state, terminated, truncated, states, actions";
 /// Rows that a page of whole trajectories holds at most.
 const PAGE_ROWS: usize = 512;
 
@@ -163,6 +162,8 @@ pub(super) fn summaries(
 pub struct Cursor {
     place: Place,
     collections: Collections,
+    /// What is read in the place of the rewards.
+    rewards: &'static str,
 }
 
 #[derive(Debug)]
@@ -185,7 +186,12 @@ impl Cursor {
             let rows = statement.query_map(params_from_iter(condition.values()), |row| row.get(0))?;
             Place::Rows(rows.collect::<rusqlite::Result<_>>()?)
         };
-        Ok(Self { place, collections: Collections::default() })
+        Ok(Self { place, collections: Collections::default(), rewards: "rewards" })
+    }
+
+    /// Leaves the rewards on the disk, where they are half of what there is to read: trajectories come without.
+    pub(super) fn without_rewards(self) -> Self {
+        Self { rewards: "x''", ..self }
     }
 
     /// The next trajectories: at least one unless there are no more, then so many as fit into `max_bytes`.
@@ -196,19 +202,23 @@ impl Cursor {
         max_bytes: usize,
     ) -> Result<Vec<Recording>, StoreError> {
         let fail = |e: rusqlite::Error| StoreError::from_sqlite(path, &e);
+        let rewards = self.rewards;
         let (sql, values): (String, Vec<Value>) = match &self.place {
             Place::Scan { filter, after, last } => {
                 let mut condition = Condition::new(connection, filter).map_err(fail)?;
                 condition.and("seq > ? AND seq <= ?", [Value::from(*after), Value::from(*last)]);
                 let sql = format!(
-                    "SELECT {COLUMNS} FROM trajectories WHERE {} ORDER BY seq LIMIT {PAGE_ROWS}",
+                    "SELECT {COLUMNS}, {rewards} FROM trajectories WHERE {} ORDER BY seq LIMIT {PAGE_ROWS}",
                     condition.sql()
                 );
                 (sql, condition.into_values())
             }
             Place::Rows(left) => {
                 let next = left.iter().rev().take(PAGE_ROWS).map(i64::to_string).collect::<Vec<_>>().join(", ");
-                (format!("SELECT {COLUMNS} FROM trajectories WHERE seq IN ({next}) ORDER BY seq"), Vec::new())
+                (
+                    format!("SELECT {COLUMNS}, {rewards} FROM trajectories WHERE seq IN ({next}) ORDER BY seq"),
+                    Vec::new(),
+                )
             }
         };
         let mut statement = connection.prepare(&sql).map_err(fail)?;

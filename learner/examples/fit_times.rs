@@ -1,4 +1,5 @@
-//! Times of this crate's fits on the reference maze and demonstrations, and of one gradient in grids, as JSON: what
+//! Times of this crate's fits on the reference maze and demonstrations (on the clock), and of one gradient in grids
+//! (processor time, from cold and from near by), as JSON: what
 //! `tests/bench/irl.py` sets beside its peers.
 //!
 //! `cargo run --release -p mazeway-learner --no-default-features --example fit_times -- [ROUNDS [METHOD…]]`
@@ -12,6 +13,7 @@ use mazeway_learner::irl::em_tied::Likelihood;
 use mazeway_learner::irl::{self, Basis, FitOptions, PosteriorKind, Problem};
 use serde_json::{Map, Value, json};
 use std::ops::ControlFlow;
+use std::sync::OnceLock;
 use std::time::Instant;
 
 /// Seconds of each of `rounds` calls.
@@ -22,6 +24,15 @@ fn times(rounds: usize, mut run: impl FnMut()) -> Value {
         begun.elapsed().as_secs_f64()
     };
     (0..rounds).map(once).collect::<Vec<f64>>().into()
+}
+
+/// Seconds for which this thread held a processor, in ticks of some milliseconds; on the clock where Linux does not say.
+fn processor_secs() -> f64 {
+    static START: OnceLock<Instant> = OnceLock::new();
+    let on_the_clock = || START.get_or_init(Instant::now).elapsed().as_secs_f64();
+    let schedule = std::fs::read_to_string("/proc/thread-self/schedstat").unwrap_or_default();
+    let nanoseconds = schedule.split(' ').next().and_then(|first| first.parse::<u64>().ok());
+    nanoseconds.map_or_else(on_the_clock, |ns| ns as f64 * 1e-9)
 }
 
 fn main() {
@@ -55,9 +66,14 @@ fn main() {
         let basis = Basis::state(&grid.mdp);
         let steps = grid.steps(rounds + 1);
         let mut likelihood = Likelihood::new(&grid.mdp, &basis, grid.counts.clone(), 0.9);
-        let cold = times(1, || drop(likelihood.value_and_gradient(&steps[0])));
-        let mut next = steps[1..].iter();
-        let warm = times(rounds, || drop(next.next().map(|weights| likelihood.value_and_gradient(weights))));
+        let begun = processor_secs();
+        likelihood.value_and_gradient(&steps[0]);
+        let cold = processor_secs() - begun;
+        let begun = processor_secs();
+        for weights in &steps[1..] {
+            likelihood.value_and_gradient(weights);
+        }
+        let warm = json!([(processor_secs() - begun) / rounds as f64]);
         let residual = likelihood.residual().max(likelihood.solver().residual());
         gradients.insert((side * side).to_string(), json!({ "cold": cold, "warm": warm, "residual": residual }));
     }

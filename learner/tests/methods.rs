@@ -4,8 +4,8 @@ mod random;
 
 use mazeway_learner::irl::em_tied::{Likelihood, fit_with_basis};
 use mazeway_learner::irl::{
-    self, Basis, BasisKind, Fit, FitError, FitOptions, HorizonPrior, METHODS, MStep, Penalty, PlannerKind, Problem,
-    Responsibility, RewardPrior, Stopped,
+    self, Basis, BasisKind, Fit, FitError, FitOptions, HorizonPrior, METHODS, MStep, Penalty, PlannerKind,
+    PosteriorKind, Problem, Responsibility, RewardPrior, Stopped,
 };
 use mazeway_learner::mdp::{Features, TabularMdp};
 use mazeway_learner::statistics::Statistics;
@@ -132,7 +132,7 @@ proptest! {
         }).collect();
         let reference = below(n, &mut random);
         for (id, m_step) in [("em", MStep::Nnls), ("em", MStep::Simplex), ("em-mixture", MStep::Nnls), ("em-tied", MStep::Nnls), ("bc", MStep::Nnls)] {
-            let options = FitOptions { m_step, reference_basis: reference as u32, tolerance: 1e-9, penalty_strength: Some(0.5), ..FitOptions::default() };
+            let options = FitOptions { m_step, reference_basis: reference as u32, tolerance: 1e-9, penalty_strength: Some(0.5), posterior: PosteriorKind::None, ..FitOptions::default() };
             let found = fit(id, &original, &data, &options).expect("a fit");
             let options = FitOptions { reference_basis: order[reference] as u32, ..options };
             let moved = fit(id, &renamed, &renamed_data, &options).expect("a fit");
@@ -173,7 +173,7 @@ proptest! {
         let mut random = generator(seed);
         let mdp = mdp(n, a, 4, &mut random);
         let data = episodes(&mdp, &policy(n, a, &mut random), 20, 10, &mut random);
-        let options = FitOptions { tolerance: 1e-12, ..FitOptions::default() };
+        let options = FitOptions { tolerance: 1e-12, posterior: PosteriorKind::None, ..FitOptions::default() };
         let found = fit("em-tied", &mdp, &data, &options).expect("a fit");
         prop_assert_eq!(found.stopped, Stopped::Converged);
         let basis = Basis::state(&mdp);
@@ -290,7 +290,7 @@ fn unvisited_pairs_get_no_reward_and_their_states_a_sensible_policy() {
     let mdp = mdp(12, 3, 4, &mut random);
     let expert = policy(12, 3, &mut random);
     let data = episodes(&mdp, &expert, 3, 4, &mut random);
-    let options = FitOptions { basis: BasisKind::StateAction, ..FitOptions::default() };
+    let options = FitOptions { basis: BasisKind::StateAction, posterior: PosteriorKind::None, ..FitOptions::default() };
     let found = fit("em-tied", &mdp, &data, &options).expect("a fit");
     let counts = statistics(&mdp, &data).counts(None);
     for (pair, (w, n)) in found.weights.iter().zip(&counts).enumerate() {

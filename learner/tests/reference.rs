@@ -3,7 +3,9 @@
 mod maze;
 
 use maze::{DISCOUNT, agreement, cases, demonstrations, floats, maze, statistics};
-use mazeway_learner::irl::{self, Fit, FitOptions, HorizonPrior, MStep, Penalty, PlannerKind, Problem, Stopped};
+use mazeway_learner::irl::{
+    self, Fit, FitOptions, HorizonPrior, MStep, Penalty, PlannerKind, PosteriorKind, Problem, Stopped,
+};
 use mazeway_learner::mdp::{PlanOptions, plan};
 use std::ops::ControlFlow;
 
@@ -42,8 +44,11 @@ fn methods_reproduce_all_fits() {
     assert_eq!(cases.len(), 8);
     for case in cases {
         let method = case["method"].as_str().expect("a name");
-        let mut options =
-            FitOptions { discount: case["discount"].as_f64().expect("a number"), ..FitOptions::default() };
+        let mut options = FitOptions {
+            discount: case["discount"].as_f64().expect("a number"),
+            posterior: PosteriorKind::None,
+            ..FitOptions::default()
+        };
         options.horizon_prior = match case["horizon_prior"].as_str() {
             Some("uniform") => HorizonPrior::Uniform,
             _ => HorizonPrior::Geometric,

@@ -143,7 +143,7 @@ fn any_options(random: &mut Pcg64) -> FitOptions {
         ),
         penalty: pick(&[Penalty::L1, Penalty::L2, Penalty::None], random),
         penalty_strength: pick(&[None, Some(0.0), Some(1e-3), Some(1.0), Some(1e3)], random),
-        posterior: pick(&[PosteriorKind::None, PosteriorKind::Laplace, PosteriorKind::Hmc], random),
+        posterior: pick(&[PosteriorKind::None, PosteriorKind::Laplace, PosteriorKind::Mcmc], random),
         reward_prior: pick(&[RewardPrior::Uniform, RewardPrior::Exponential, RewardPrior::Beta], random),
         rationality: pick(&[0.0, 1.0, 10.0, 1e3], random),
         chains: pick(&[1, 2], random),

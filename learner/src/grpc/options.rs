@@ -53,7 +53,7 @@ pub fn from_proto(message: Option<&pb::FitOptions>) -> Result<FitOptions, FieldE
             pb::PosteriorKind::Unspecified => default.posterior,
             pb::PosteriorKind::None => PosteriorKind::None,
             pb::PosteriorKind::Laplace => PosteriorKind::Laplace,
-            pb::PosteriorKind::Hmc => PosteriorKind::Hmc,
+            pb::PosteriorKind::Mcmc => PosteriorKind::Mcmc,
         },
         reward_prior: match known("reward_prior", m.reward_prior)? {
             pb::RewardPrior::Unspecified => default.reward_prior,
@@ -118,7 +118,7 @@ pub fn to_proto(options: &FitOptions) -> pb::FitOptions {
         posterior: match options.posterior {
             PosteriorKind::None => pb::PosteriorKind::None,
             PosteriorKind::Laplace => pb::PosteriorKind::Laplace,
-            PosteriorKind::Hmc => pb::PosteriorKind::Hmc,
+            PosteriorKind::Mcmc => pb::PosteriorKind::Mcmc,
         } as i32,
         reward_prior: match options.reward_prior {
             RewardPrior::Uniform => pb::RewardPrior::Uniform,

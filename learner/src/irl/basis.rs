@@ -73,6 +73,17 @@ impl Basis {
         reward
     }
 
+    /// Brings `reward` up to date after the weights of some functions changed: the very numbers of [`Basis::reward`].
+    pub(super) fn update_reward(&self, weights: &[f64], changed: impl Iterator<Item = usize>, reward: &mut [f64]) {
+        match &self.kind {
+            Kind::State { n_actions } => {
+                changed.for_each(|b| reward[b * n_actions..(b + 1) * n_actions].fill(weights[b]));
+            }
+            Kind::StateAction => changed.for_each(|b| reward[b] = weights[b]),
+            Kind::Features(_) => reward.copy_from_slice(&self.reward(weights)),
+        }
+    }
+
     /// Σ_{s,a} values(s,a) Φ(s,a), shape (`n_basis`,).
     pub fn project(&self, values: &[f64]) -> Vec<f64> {
         let mut projected = vec![0.0; self.n_functions];

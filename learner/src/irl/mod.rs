@@ -261,6 +261,14 @@ impl<'a> Trace<'a> {
         self.entries.push(entry);
         if (self.progress)(&entry).is_break() { Err(FitError::Cancelled) } else { Ok(()) }
     }
+
+    /// Asks whether to go on where there is nothing new to tell.
+    fn check(&mut self) -> Result<(), FitError> {
+        match self.entries.last() {
+            Some(entry) if (self.progress)(entry).is_break() => Err(FitError::Cancelled),
+            _ => Ok(()),
+        }
+    }
 }
 
 /// How a fit stopped.

@@ -60,9 +60,9 @@ pub enum PosteriorKind {
     None,
     /// The posterior mean, from a Gaussian around the optimum.
     Laplace,
-    /// The posterior mean, from Hamiltonian Monte Carlo.
+    /// The posterior mean, from Markov chain Monte Carlo under a sparse prior whose strength is learned.
     #[default]
-    Hmc,
+    Mcmc,
 }
 
 /// Prior of `birl` over the reward of each basis function, Ramachandran & Amir (2007) §3.

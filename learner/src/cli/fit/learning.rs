@@ -105,8 +105,8 @@ pub enum PosteriorArg {
     None,
     /// The posterior mean, from a Gaussian around the optimum
     Laplace,
-    /// The posterior mean, from Hamiltonian Monte Carlo
-    Hmc,
+    /// The posterior mean, from Markov chain Monte Carlo under a sparse prior whose strength is learned
+    Mcmc,
 }
 
 /// Prior of `birl`.
@@ -160,7 +160,7 @@ pub struct LearningArgs {
     #[arg(long, default_value_t = 1000, value_name = "N", help_heading = "Learning",
           value_parser = clap::value_parser!(u32).range(1..))]
     pub max_iterations: u32,
-    /// What em-tied acts on [default: hmc]
+    /// What em-tied acts on [default: mcmc]
     #[arg(long, value_enum, value_name = "KIND", help_heading = "Learning")]
     pub posterior: Option<PosteriorArg>,
     /// Prior of birl over the reward of each basis function [default: exponential]
@@ -278,7 +278,7 @@ impl LearningArgs {
                 match posterior {
                     PosteriorArg::None => pb::PosteriorKind::None,
                     PosteriorArg::Laplace => pb::PosteriorKind::Laplace,
-                    PosteriorArg::Hmc => pb::PosteriorKind::Hmc,
+                    PosteriorArg::Mcmc => pb::PosteriorKind::Mcmc,
                 }
                 .into()
             }),

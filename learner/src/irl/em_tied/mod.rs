@@ -5,11 +5,18 @@
 //! quasi-Newton method with bounds. With free weights and no penalty this is the maximum-likelihood estimator of dynamic
 //! discrete choice (Rust 1987), and standard errors come from the exact Hessian.
 //!
-//! The greedy policy takes the best actions under the soft Q itself, not those of a hard planner on the learned reward: the
-//! two agree where the reward is large against the temperature, and where data are few the soft one follows them better.
+//! The optimum is a point; with few demonstrations many rewards explain them. Under the penalty L1 the default goes on to the
+//! posterior under a sparse prior ([`spike_slab`]) and acts on its mean, which minimises the expected loss of value over all
+//! rewards that may be true (Ramachandran & Amir 2007, theorem 3). Without a posterior the greedy policy takes the best
+//! actions under the soft Q itself, not those of a hard planner on the learned reward.
 
 mod finite;
+mod laplace;
 mod likelihood;
+mod optimum;
+mod posterior;
+mod soft_process;
+mod spike_slab;
 mod standard_errors;
 
 pub use finite::FiniteLikelihood;
@@ -17,8 +24,7 @@ pub(super) use likelihood::of as soft_likelihood;
 pub use likelihood::{Likelihood, SoftLikelihood};
 pub use standard_errors::{MAX_STANDARD_ERRORS, standard_errors};
 
-use super::bounded::{self, Settings};
-use super::{Basis, Fit, FitError, FitOptions, Method, Penalty, PlannerKind, Problem, Progress, Trace};
+use super::{Basis, Fit, FitError, FitOptions, Method, Penalty, PlannerKind, PosteriorKind, Problem, Progress, Trace};
 use crate::mdp::Policy;
 
 /// The policy tied to the reward.
@@ -30,11 +36,11 @@ impl Method for EmTied {
     }
 
     fn description(&self) -> &'static str {
-        "maximum likelihood of the soft-optimal policy, penalised; the most accurate"
+        "the policy tied to the reward: posterior mean under a sparse prior, or maximum likelihood"
     }
 
     fn log_prior(&self, options: &FitOptions, fit: &Fit) -> f64 {
-        let strength = options.penalty_strength.unwrap_or(1.0);
+        let strength = strength(options);
         match options.penalty {
             Penalty::L1 => -strength * fit.weights.iter().sum::<f64>(),
             Penalty::L2 => -0.5 * strength * fit.weights.iter().map(|w| w * w).sum::<f64>(),
@@ -47,7 +53,7 @@ impl Method for EmTied {
     }
 }
 
-/// Fits with any basis; `problem.options.basis` is not looked at.
+/// Fits with any basis; `problem.options.basis` says only which functions lie near each other.
 ///
 /// # Errors
 /// As [`Method::fit`]. With a discount of 1 the policy is the one of K steps, K the options' horizon or the longest
@@ -57,80 +63,64 @@ pub fn fit_with_basis(problem: &Problem<'_>, basis: &Basis, progress: Progress<'
     let options = problem.options;
     let mut trace = Trace::new(progress);
     let mut likelihood = likelihood::of(problem, basis)?;
-    let strength = options.penalty_strength.unwrap_or(1.0);
-    let settings = Settings {
-        lower: if options.penalty == Penalty::L1 { 0.0 } else { f64::NEG_INFINITY },
-        tolerance: options.tolerance,
-        max_iterations: options.max_iterations,
-    };
-    let minimum = bounded::minimise(
-        &settings,
-        vec![0.0; basis.len()],
-        |weights| {
-            let (log_likelihood, mut gradient) = likelihood.value_and_gradient(weights);
-            let mut value = -log_likelihood;
-            for (g, w) in gradient.iter_mut().zip(weights) {
-                *g = -*g;
-                match options.penalty {
-                    Penalty::L1 => {
-                        value += strength * w;
-                        *g += strength;
-                    }
-                    Penalty::L2 => {
-                        value += 0.5 * strength * w * w;
-                        *g += strength * w;
-                    }
-                    Penalty::None => {}
-                }
-            }
-            (value, gradient)
-        },
-        |value, decrease| trace.record(-value, decrease),
-    )?;
-
-    let weights = minimum.x;
-    likelihood.value_and_gradient(&weights);
-    let mut warnings = Vec::new();
-    if matches!(options.planner, PlannerKind::PolicyIteration | PlannerKind::ExpectationMaximization) {
-        warnings
-            .push("em-tied has no planner to choose: its policy is the soft-optimal one by construction".to_owned());
-    }
-    let mut errors = None;
-    if options.penalty == Penalty::None {
-        if basis.len() <= MAX_STANDARD_ERRORS {
-            let found = standard_errors(&mut *likelihood, &weights);
-            let undetermined = found.iter().filter(|e| e.is_infinite()).count();
-            if undetermined > 0 {
-                warnings.push(format!(
-                    "the demonstrations do not determine {undetermined} of {} weights: their standard errors are infinite",
-                    basis.len()
-                ));
-            }
-            errors = Some(found);
-        } else {
-            warnings.push(format!(
-                "no standard errors: expected at most {MAX_STANDARD_ERRORS} basis functions, got {}",
-                basis.len()
-            ));
+    let optimum = match (options.penalty, options.posterior, options.penalty_strength) {
+        (Penalty::L2, PosteriorKind::Laplace | PosteriorKind::Mcmc, None) if basis.len() <= MAX_STANDARD_ERRORS => {
+            laplace::evidence(problem, &mut *likelihood, basis.len(), &mut trace)?
         }
+        _ => optimum::find(problem, &mut *likelihood, vec![0.0; basis.len()], strength(options), &mut trace)?,
+    };
+    likelihood.value_and_gradient(&optimum.weights);
+    let mut warnings = Vec::new();
+    if options.posterior == PosteriorKind::None
+        && matches!(options.planner, PlannerKind::PolicyIteration | PlannerKind::ExpectationMaximization)
+    {
+        warnings.push("em-tied without a posterior has no planner to choose: its policy is soft-optimal".to_owned());
     }
     if !likelihood.converged() {
         warnings.push("the soft values stopped before they converged".to_owned());
     }
     let n_actions = problem.mdp.n_actions();
-    let iterations = trace.entries.len() as u32;
-    Ok(Fit {
-        reward: basis.reward(&weights),
+    let mut fit = Fit {
+        reward: basis.reward(&optimum.weights),
         policy: Policy::boltzmann(n_actions, likelihood.action_values(), 1.0).into_probabilities(),
         greedy_policy: Policy::greedy(n_actions, likelihood.action_values()).into_probabilities(),
         state_values: likelihood.state_values().to_vec(),
-        standard_errors: errors,
+        standard_errors: None,
         posterior: None,
         hyperparameters: Vec::new(),
-        weights,
-        trace: trace.entries,
-        stopped: minimum.stopped,
-        iterations,
+        weights: optimum.weights,
+        trace: Vec::new(),
+        stopped: optimum.stopped,
+        iterations: trace.entries.len() as u32,
         warnings,
-    })
+    };
+    if options.penalty == Penalty::None {
+        add_standard_errors(&mut *likelihood, &mut fit);
+    } else if options.posterior != PosteriorKind::None {
+        posterior::add(problem, basis, &mut *likelihood, optimum.strength, &mut fit, &mut trace)?;
+    }
+    fit.trace = trace.entries;
+    Ok(fit)
+}
+
+/// Strength of the penalty of the optimum.
+fn strength(options: &FitOptions) -> f64 {
+    options.penalty_strength.unwrap_or(1.0)
+}
+
+fn add_standard_errors(likelihood: &mut dyn SoftLikelihood, fit: &mut Fit) {
+    let n_basis = fit.weights.len();
+    if n_basis > MAX_STANDARD_ERRORS {
+        fit.warnings
+            .push(format!("no standard errors: expected at most {MAX_STANDARD_ERRORS} basis functions, got {n_basis}"));
+        return;
+    }
+    let found = standard_errors(likelihood, &fit.weights);
+    let undetermined = found.iter().filter(|e| e.is_infinite()).count();
+    if undetermined > 0 {
+        fit.warnings.push(format!(
+            "the demonstrations do not determine {undetermined} of {n_basis} weights: their standard errors are infinite"
+        ));
+    }
+    fit.standard_errors = Some(found);
 }

@@ -14,6 +14,8 @@ const MAX_ROUNDS: u32 = 20;
 const SETTLED: f64 = 1e-3;
 /// α stays within these.
 const RANGE: (f64, f64) = (1e-8, 1e8);
+/// A slope below this is rounding.
+const LEAST_SLOPE: f64 = 1e-6;
 /// Half-width of a central 95% interval of a Gaussian in standard deviations.
 const NORMAL_975: f64 = 1.959_963_984_540_054;
 
@@ -68,7 +70,7 @@ pub(super) fn around(
     }
     if l1 {
         for b in (0..n).filter(|&b| weights[b] <= 0.0) {
-            let scale = 1.0 / slopes[b].max(f64::MIN_POSITIVE.sqrt());
+            let scale = 1.0 / slopes[b].max(LEAST_SLOPE);
             (mean[b], deviations[b]) = (scale, scale);
             low[b] = -(-0.025_f64).ln_1p() * scale;
             high[b] = -(0.025_f64).ln() * scale;
@@ -85,6 +87,9 @@ fn information(likelihood: &mut dyn SoftLikelihood, weights: &[f64]) -> DMatrix<
 
 /// Diagonal of the inverse; infinite along directions of no precision.
 fn variances(precision: &DMatrix<f64>) -> Vec<f64> {
+    if precision.is_empty() {
+        return Vec::new();
+    }
     let eigen = SymmetricEigen::new(precision.clone());
     let largest = eigen.eigenvalues.iter().copied().fold(0.0, f64::max);
     (0..precision.nrows())

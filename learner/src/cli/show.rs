@@ -139,7 +139,8 @@ fn by_state(values: &[f64], n_actions: usize) -> Vec<Vec<f64>> {
 
 fn fit_json(fit: &pb::Fit, names: &(Names, Names)) -> Result<Value, CliError> {
     let (s, a) = (fit.n_states as usize, fit.n_actions as usize);
-    let weights = array(&fit.weights, fit.weights.len() / 8, "weights")?;
+    let weights_len = fit.weights.len() / 8;
+    let weights = array(&fit.weights, weights_len, "weights")?;
     let request = fit.request.clone().unwrap_or_default();
     let trace = fit.trace.iter();
     let trace = trace.map(|e| json!({"iteration": e.iteration, "objective": e.objective, "change": e.change, "elapsed_secs": e.elapsed_secs}));
@@ -169,12 +170,35 @@ fn fit_json(fit: &pb::Fit, names: &(Names, Names)) -> Result<Value, CliError> {
         "features": fit.feature_names,
         "weights": weights,
         "standard_errors": array(&fit.standard_errors, fit.standard_errors.len() / 8, "standard errors")?,
+        "posterior": posterior_json(fit, weights_len)?,
+        "hyperparameters": fit.hyperparameters.iter().map(|h| (h.name.clone(), json!(h.value))).collect::<serde_json::Map<_, _>>(),
         "reward": by_state(&array(&fit.reward, s * a, "the reward")?, a),
         "policy": by_state(&array(&fit.policy, s * a, "the policy")?, a),
         "greedy_policy": by_state(&array(&fit.greedy_policy, s * a, "the greedy policy")?, a),
         "state_values": array(&fit.state_values, s, "the state values")?,
         "state_visits": array(&fit.state_visits, s, "the state visits")?,
         "trace": trace.collect::<Vec<_>>(),
+    }))
+}
+
+/// Intervals of the weights; null where the method has none.
+fn posterior_json(fit: &pb::Fit, weights: usize) -> Result<Value, CliError> {
+    let Some(posterior) = &fit.posterior else { return Ok(Value::Null) };
+    let diagnostics = match &posterior.diagnostics {
+        None => Value::Null,
+        Some(d) => json!({
+            "chains": d.chains,
+            "draws": d.draws,
+            "acceptance": d.acceptance,
+            "split_rhat": array(&d.split_rhat, weights, "split R-hat")?,
+            "effective_sample_size": array(&d.effective_sample_size, weights, "effective sample sizes")?,
+        }),
+    };
+    Ok(json!({
+        "standard_deviations": array(&posterior.standard_deviations, weights, "standard deviations")?,
+        "low": array(&posterior.low, weights, "lower ends")?,
+        "high": array(&posterior.high, weights, "upper ends")?,
+        "diagnostics": diagnostics,
     }))
 }
 
@@ -207,6 +231,10 @@ fn fit_text(fit: &pb::Fit, names: &(Names, Names)) -> Result<String, CliError> {
         ("agreement", format!("{:.3} of the demonstrated steps", fit.agreement)),
         ("log-likelihood", format!("{:.4} a step", fit.log_likelihood_per_step)),
         ("stopped", format!("{} after {} iterations, {:.3} s", stopped(fit.stopped), fit.iterations, fit.fit_secs)),
+        ("learned beside it", {
+            let told = fit.hyperparameters.iter().map(|h| format!("{} {:.4}", h.name, h.value));
+            told.collect::<Vec<_>>().join(", ")
+        }),
         ("version", fit.version.clone()),
     ]);
     for warning in &fit.warnings {

@@ -3,7 +3,10 @@
 //! Policies are flat π(a|s), shape (`n_states * n_actions`,), as a [`Fit`](crate::irl::Fit) holds them; a greedy policy splits
 //! ties evenly, and so does every measure here. Deliberately absent: roll-outs in a simulator, which give the rest.
 
+pub mod calibration;
 pub mod comparison;
+pub mod transfer;
+pub mod validation;
 
 use crate::mdp::{PlanError, PlanOptions, PlannerKind, Policy, TabularMdp, evaluate_policy, plan};
 use crate::trajectory::Trajectory;

@@ -202,6 +202,7 @@ fn groups(report: &Report, pictures: &[Picture]) -> Vec<Value> {
     if report.true_reward.is_some() {
         groups.extend(group("weights", "What it values", "", named(&["features"])));
         groups.extend(group("want", "What it wants", "Learned beside true.", named(&["reward", "true_reward"])));
+        groups.extend(group("open", "What is open", "What the data leave open.", named(&["uncertainty", "weights"])));
         groups.extend(group("does", "What it does", "Learned beside optimal.", named(&["policy", "optimal_policy"])));
         groups.extend(group("seen", "What was seen, and what it is worth", "", named(&["visits", "values"])));
     } else {
@@ -212,8 +213,10 @@ fn groups(report: &Report, pictures: &[Picture]) -> Vec<Value> {
         };
         groups.extend(group("weights", "What it wants", "", named(&["features"])));
         groups.extend(group("learned", "What was learned", "", named(&pair)));
+        groups.extend(group("open", "What is open", "What the data leave open.", named(&["uncertainty", "weights"])));
         groups.extend(group("seen", "What was seen, and what it is worth", "", named(&["visits", "values"])));
     }
+    groups.extend(group("judged", "How well it predicts", "Cross-validation.", named(&["calibration"])));
     groups
 }
 

@@ -2,6 +2,7 @@
 //!
 //! Invariant: every number is finite; what is not known or not finite is `null`, so that a strict parser reads it.
 
+use super::uncertainty::UncertaintySource;
 use super::{DriverMetrics, Drivers, Interval, Report};
 use serde::{Serialize, Serializer};
 use std::path::Path;
@@ -9,8 +10,8 @@ use std::path::Path;
 /// The object as text, without a final newline. `report` is the path of `report.html`.
 ///
 /// Keys: `env, style, method, trajectories, horizon, drivers, agreement, states_covered, stopped, iterations, fit_secs,
-/// total_secs, report`; where no driver is rolled out (a maze) `expected_value_difference` stands in place of `drivers`.
-/// A fit of features adds `features`.
+/// total_secs, report`, and, where there are any, `uncertainty`, `hyperparameters`, `validation`, `transfer` and
+/// `features`; where no driver is rolled out (a maze) `expected_value_difference` stands in place of `drivers`.
 pub fn to_string(report: &Report, path: Option<&Path>) -> String {
     serde_json::to_string(&Summary::new(report, path)).expect("plain structs of numbers and text serialise")
 }
@@ -34,6 +35,15 @@ struct Summary<'a> {
     report: Option<String>,
     #[serde(skip_serializing_if = "Vec::is_empty")]
     features: Vec<FeatureJson<'a>>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    uncertainty: Option<UncertaintyJson<'a>>,
+    #[serde(skip_serializing_if = "<[_]>::is_empty")]
+    hyperparameters: &'a [crate::irl::Hyperparameter],
+    // What is not finite becomes null: the ends of an interval over one trajectory.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    validation: Option<&'a crate::eval::validation::Validation>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    transfer: Option<TransferJson<'a>>,
 }
 
 /// A feature's weight, and how much of it there is a step.
@@ -44,6 +54,33 @@ struct FeatureJson<'a> {
     demonstrated: Finite,
     learned: Finite,
     random: Finite,
+}
+
+/// An infinite standard deviation and the ends of its interval are null.
+#[derive(Serialize)]
+struct UncertaintyJson<'a> {
+    source: &'static str,
+    weights: &'a [f64],
+    standard_deviations: &'a [f64],
+    low: &'a [f64],
+    high: &'a [f64],
+    #[serde(skip_serializing_if = "Option::is_none")]
+    diagnostics: Option<&'a crate::irl::Diagnostics>,
+}
+
+#[derive(Serialize)]
+struct TransferJson<'a> {
+    target: &'a str,
+    new_states: u64,
+    rows: Vec<TransferRowJson<'a>>,
+}
+
+#[derive(Serialize)]
+struct TransferRowJson<'a> {
+    name: &'a str,
+    agreement: Option<f64>,
+    expected_value_difference: Option<f64>,
+    metrics: Option<MetricsJson>,
 }
 
 impl<'a> Summary<'a> {
@@ -68,6 +105,33 @@ impl<'a> Summary<'a> {
             total_secs: Finite(report.total_secs),
             report: path.map(|path| path.display().to_string()),
             features: report.features.iter().map(FeatureJson::new).collect(),
+            uncertainty: report.uncertainty.as_ref().map(|uncertainty| UncertaintyJson {
+                source: match uncertainty.source {
+                    UncertaintySource::StandardErrors => "standard-errors",
+                    UncertaintySource::Posterior => "posterior",
+                },
+                weights: &report.weights,
+                standard_deviations: &uncertainty.standard_deviations,
+                low: &uncertainty.low,
+                high: &uncertainty.high,
+                diagnostics: uncertainty.diagnostics.as_ref(),
+            }),
+            hyperparameters: &report.hyperparameters,
+            validation: report.validation.as_ref(),
+            transfer: report.transfer.as_ref().map(|transfer| TransferJson {
+                target: &transfer.target,
+                new_states: transfer.new_states,
+                rows: transfer
+                    .rows
+                    .iter()
+                    .map(|row| TransferRowJson {
+                        name: &row.name,
+                        agreement: row.agreement,
+                        expected_value_difference: row.expected_value_difference,
+                        metrics: row.metrics.map(Into::into),
+                    })
+                    .collect(),
+            }),
         }
     }
 }

@@ -16,12 +16,15 @@ mod space;
 pub mod table;
 #[cfg(test)]
 mod tests;
+pub mod uncertainty;
 pub mod write;
 
 pub use crate::eval::Interval;
 pub use format::duration;
 
-use crate::irl::{FitOptions, Stopped, TraceEntry};
+use self::uncertainty::Uncertainty;
+use crate::eval::validation::Validation;
+use crate::irl::{FitOptions, Hyperparameter, Stopped, TraceEntry};
 use serde::{Deserialize, Serialize};
 
 /// How a driver drives: means per step over roll-outs.
@@ -94,6 +97,30 @@ pub struct GridLayout {
     pub cells: Vec<u32>,
 }
 
+/// What was learned in one model, used in another.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Transfer {
+    /// The other model, in a few words.
+    pub target: String,
+    /// Its states that the first does not have.
+    pub new_states: u64,
+    /// Who acts there, and how well.
+    pub rows: Vec<TransferRow>,
+}
+
+/// One way to act in another model.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TransferRow {
+    /// Such as "reward planned on anew".
+    pub name: String,
+    /// Share of the states whose action is optimal there, where the truth is known.
+    pub agreement: Option<f64>,
+    /// What is lost there, where the truth is known.
+    pub expected_value_difference: Option<f64>,
+    /// How it drives there, where the environment counts that.
+    pub metrics: Option<DriverMetrics>,
+}
+
 /// Everything that is shown of a fit.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Report {
@@ -133,6 +160,14 @@ pub struct Report {
     /// States that the demonstrations visit.
     pub states_covered: u32,
 
+    /// Weights of the basis functions, shape (B,).
+    pub weights: Vec<f64>,
+    /// Their names; empty where the states and actions name them.
+    pub weight_names: Vec<String>,
+    /// What the data leave open of them, where the method says.
+    pub uncertainty: Option<Uncertainty>,
+    /// What the method learned beside the reward.
+    pub hyperparameters: Vec<Hyperparameter>,
     /// R(s,a), shape (S, A).
     pub reward: Vec<f64>,
     /// π(a|s) that explains the demonstrations, shape (S, A).
@@ -174,6 +209,11 @@ pub struct Report {
     pub true_reward: Option<Vec<f64>>,
     /// Optimal policy under the true reward, ties split evenly, shape (S, A), where known.
     pub optimal_policy: Option<Vec<f64>>,
+
+    /// Cross-validation over the trajectories, where asked for.
+    pub validation: Option<Validation>,
+    /// What was learned, used in another model, where asked for.
+    pub transfer: Option<Transfer>,
 
     /// Where each state lies, for environments on a grid.
     pub grid: Option<GridLayout>,
@@ -260,6 +300,9 @@ impl Report {
         exactly("policy", self.policy.len(), s * a)?;
         exactly("greedy_policy", self.greedy_policy.len(), s * a)?;
         exactly("state_values", self.state_values.len(), s)?;
+        if let Some(uncertainty) = &self.uncertainty {
+            uncertainty.check(self.weights.len())?;
+        }
         if let Some(reward) = &self.true_reward
             && reward.len() != s
         {

@@ -11,6 +11,8 @@ use std::io::IsTerminal;
 
 /// States listed where the environment has no layout that is known here.
 const MOST_STATES: usize = 40;
+/// Weights listed at most.
+const MOST_WEIGHTS: usize = 12;
 const RULE: LineStyle = LineStyle::none().fill('─').junction('─');
 const STYLE: TableStyle = TableStyle::new().top_border(RULE).header_separator(RULE).bottom_border(RULE);
 
@@ -72,6 +74,9 @@ pub fn render(report: &Report, terminal: Terminal) -> Result<String, ReportError
     parts.push(summary(report, terminal));
     parts.extend(features(report, terminal));
     parts.push(states(report, terminal));
+    parts.extend(weights(report, terminal));
+    parts.extend(reliability(report, terminal));
+    parts.extend(transfer(report, terminal));
     if !report.warnings.is_empty() {
         let lines = report
             .warnings
@@ -80,6 +85,80 @@ pub fn render(report: &Report, terminal: Terminal) -> Result<String, ReportError
         parts.push(lines.collect::<Vec<_>>().join("\n"));
     }
     Ok(parts.join("\n\n") + "\n")
+}
+
+/// The weights with their intervals; `None` where none are known.
+fn weights(report: &Report, terminal: Terminal) -> Option<String> {
+    let uncertainty = report.uncertainty.as_ref()?;
+    let shown = report.leading_weights(MOST_WEIGHTS);
+    let mut table = terminal.table();
+    table.set_header(["weight", "estimate", "standard deviation", "95 % interval"].map(head));
+    for &weight in &shown {
+        let sd = uncertainty.standard_deviations[weight];
+        let sd = if sd.is_finite() { brief(sd) } else { "∞".to_owned() };
+        let row =
+            [report.weight_name(weight, 60), brief(report.weights[weight]), sd, uncertainty.interval(weight)].map(Cell::new);
+        table.add_row(row.map(|cell| if uncertainty.determined(weight) { cell } else { cell.fg(Color::DarkGrey) }));
+    }
+    right_align(&mut table, 1..4);
+    let some = if shown.len() < report.weights.len() {
+        format!("  the {} largest of {}", shown.len(), count(report.weights.len() as f64))
+    } else {
+        String::new()
+    };
+    Some(format!("{}{}\n{}", terminal.heading("Weights"), terminal.dim(&some), table.trim_fmt()))
+}
+
+/// Predicted against observed; `None` where nothing was held out.
+fn reliability(report: &Report, terminal: Terminal) -> Option<String> {
+    let validation = report.validation.as_ref()?;
+    let mut table = terminal.table();
+    table.set_header(["predicted", "came true", "predictions"].map(head));
+    for bin in validation.calibration.bins.iter().filter(|bin| bin.predictions > 0) {
+        table.add_row([fixed(bin.predicted, 3), fixed(bin.observed, 3), count(bin.predictions as f64)]);
+    }
+    right_align(&mut table, 0..3);
+    let note = "  probabilities of actions on trajectories that the fit did not see";
+    Some(format!("{}{}\n{}", terminal.heading("Calibration"), terminal.dim(note), table.trim_fmt()))
+}
+
+/// What was learned, in another model; `None` where none was asked for.
+fn transfer(report: &Report, terminal: Terminal) -> Option<String> {
+    let transfer = report.transfer.as_ref()?;
+    let mut table = terminal.table();
+    let known: Vec<&DriverMetrics> = transfer.rows.iter().filter_map(|row| row.metrics.as_ref()).collect();
+    let truth = transfer.rows.iter().any(|row| row.expected_value_difference.is_some());
+    let mut header = vec![head("acting on")];
+    if truth {
+        header.extend([head("agreement"), head("expected value difference")]);
+    }
+    if !known.is_empty() {
+        header.extend(METRICS.iter().map(|metric| head(metric.name)));
+    }
+    let columns = header.len();
+    table.set_header(header);
+    for row in &transfer.rows {
+        let mut cells = vec![clip(&row.name, 60)];
+        if truth {
+            cells.push(row.agreement.map_or_else(|| MISSING.to_owned(), percent));
+            cells.push(row.expected_value_difference.map_or_else(|| MISSING.to_owned(), difference_text));
+        }
+        if !known.is_empty() {
+            cells.extend(METRICS.iter().map(|metric| {
+                row.metrics
+                    .as_ref()
+                    .map_or_else(|| MISSING.to_owned(), |m| interval((metric.of)(m), metric.decimals(&known)))
+            }));
+        }
+        table.add_row(cells);
+    }
+    right_align(&mut table, 1..columns);
+    let new = match transfer.new_states {
+        0 => String::new(),
+        n => format!(", {} new states", count(n as f64)),
+    };
+    let what = format!("  {}{new}", clip(&transfer.target, 200));
+    Some(format!("{}{}\n{}", terminal.heading("In another model"), terminal.dim(&what), table.trim_fmt()))
 }
 
 /// A header cell.
@@ -193,6 +272,26 @@ pub(crate) fn summary_rows(report: &Report) -> Vec<(&'static str, String)> {
             report.log_likelihood_per_step_held_out.map(|value| format!("; {} on unseen steps", fixed(value, 3)));
         format!("{} a step{}", fixed(report.log_likelihood_per_step, 3), held_out.unwrap_or_default())
     }));
+    if let Some(validation) = &report.validation {
+        rows.push((
+            "cross-validation",
+            format!(
+                "log-likelihood {} a step, agreement {} of the steps, calibration error {}; {} folds of {} trajectories",
+                interval(&validation.held_out.log_likelihood, 3),
+                interval(&validation.agreement, 3),
+                fixed(validation.calibration.expected_error, 3),
+                validation.folds,
+                count(validation.trajectories as f64),
+            ),
+        ));
+    }
+    if let Some(uncertainty) = &report.uncertainty {
+        rows.push(("uncertainty", uncertainty.summary()));
+    }
+    if !report.hyperparameters.is_empty() {
+        let told = report.hyperparameters.iter().map(|h| format!("{} {}", clip(&h.name, 60), brief(h.value)));
+        rows.push(("learned beside it", told.collect::<Vec<_>>().join(", ")));
+    }
     rows.push(("states covered", {
         let (covered, all) = (f64::from(report.states_covered), f64::from(report.n_states));
         format!("{} of {}{}", count(covered), count(all), share(covered, all))

@@ -37,6 +37,45 @@ class Progress:
         return cls(message.iteration, message.objective, message.change, message.elapsed_secs)
 
 
+@dataclass(frozen=True)
+class Posterior:
+    """What the data leave open of the weights, each array of shape (n_basis,)."""
+
+    standard_deviations: Floats
+    #: Lower ends of the central 95% intervals.
+    low: Floats
+    #: Upper ends.
+    high: Floats
+    #: Chains, draws kept of each, and the share of accepted proposals; None unless it was sampled.
+    chains: int | None = None
+    draws: int | None = None
+    acceptance: float | None = None
+    #: Near 1 where the chains agree; None unless it was sampled.
+    split_rhat: Floats | None = None
+    #: Number of independent draws that would tell as much; None unless it was sampled.
+    effective_sample_size: Floats | None = None
+
+    @classmethod
+    def from_wire(cls, message: Any, shape: tuple[int, ...]) -> Posterior:
+        """Reads the wire's `Posterior`."""
+
+        def array(part: Any, name: str) -> Floats:
+            return _arrays.unpack(getattr(part, name), _arrays.FLOAT64, shape, name)
+
+        intervals = [array(message, name) for name in ("standard_deviations", "low", "high")]
+        if not message.HasField("diagnostics"):
+            return cls(*intervals)
+        sampled = message.diagnostics
+        return cls(
+            *intervals,
+            sampled.chains,
+            sampled.draws,
+            sampled.acceptance,
+            array(sampled, "split_rhat"),
+            array(sampled, "effective_sample_size"),
+        )
+
+
 class Fit:
     """A stored fit: the reward and the policies that explain the demonstrations."""
 
@@ -68,6 +107,14 @@ class Fit:
         self.standard_errors: Floats | None = (
             array("standard_errors", self.weights.shape) if message.standard_errors else None
         )
+        #: Intervals of the weights; None where the method has no posterior.
+        self.posterior: Posterior | None = (
+            Posterior.from_wire(message.posterior, self.weights.shape)
+            if message.HasField("posterior")
+            else None
+        )
+        #: What the method learned beside the reward, such as the strength of its prior.
+        self.hyperparameters: dict[str, float] = {h.name: h.value for h in message.hyperparameters}
         #: R(s,a), shape (n_states, n_actions).
         self.reward: Floats = array("reward", pairs)
         #: pi(a|s) that explains the demonstrations, shape (n_states, n_actions).
@@ -136,6 +183,7 @@ class Fit:
             ("log-likelihood a step", f"{self.log_likelihood_per_step:.4f}"),
             ("stopped", f"{self.stopped} after {self.iterations} iterations"),
             ("time", f"{self.fit_secs:.3g} s"),
+            *((name, f"{value:.4g}") for name, value in self.hyperparameters.items()),
             *(("warning", warning) for warning in self.warnings),
         ]
 
@@ -196,6 +244,8 @@ _ENUMS = {
     "responsibility": ("Responsibility", "RESPONSIBILITY_"),
     "planner": ("Planner", "PLANNER_"),
     "penalty": ("Penalty", "PENALTY_"),
+    "posterior": ("PosteriorKind", "POSTERIOR_KIND_"),
+    "reward_prior": ("RewardPrior", "REWARD_PRIOR_"),
 }
 
 

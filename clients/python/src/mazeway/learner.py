@@ -80,7 +80,9 @@ class Learner:
                 responsibility ("approximate", "exact"),
                 planner ("value-iteration", "policy-iteration", "soft-value-iteration",
                 "expectation-maximization"), reference_basis, penalty ("l1", "l2", "none"),
-                penalty_strength, tolerance, max_iterations, smoothing, seed.
+                penalty_strength, tolerance, max_iterations, smoothing, seed,
+                posterior ("none", "laplace", "hmc"), reward_prior ("uniform", "exponential",
+                "beta"), rationality, chains, draws, warm_up.
         """
         request = _wire.learner.FitRequest(
             method=method,

@@ -48,6 +48,15 @@ pub struct FitArgs {
     /// With --model estimate: how many transitions the prior of each state-action pair is worth
     #[arg(long, value_name = "COUNT", default_value_t = 1.0)]
     pub model_prior: f64,
+    /// Cross-validate over so many folds of the trajectories: held-out log-likelihood, agreement and calibration
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(2..=10_000), help_heading = "Judging")]
+    pub folds: Option<u32>,
+    /// Plan on the learned reward in the environment under this option too, such as density=6; may be given several times
+    #[arg(long = "plan-in-option", value_name = "KEY=VALUE", help_heading = "Judging")]
+    pub plan_in_options: Vec<String>,
+    /// Plan on the learned reward in the maze drawn in this file too, with '.' for free cells and '#' for walls
+    #[arg(long, value_name = "FILE", help_heading = "Judging")]
+    pub plan_in_layout: Option<PathBuf>,
 
     /// How to learn
     #[command(flatten)]

@@ -1,13 +1,13 @@
 //! From the answers of the services to the report.
 
-use super::{evaluate::Judged, job::Job};
+use super::{evaluate::Judged, job::Job, judge::Answers};
 use crate::cli::error::CliError;
 use mazeway_client::{Model, packed::Packed};
 use mazeway_learner::{
     eval,
     irl::{self, TraceEntry},
     mdp::{Policy, TabularMdp},
-    report::{FeatureRow, GridLayout, Report, Source},
+    report::{FeatureRow, GridLayout, Report, Source, uncertainty::Uncertainty},
 };
 use mazeway_proto::learner as pb;
 use prost::bytes::Bytes;
@@ -35,6 +35,10 @@ pub struct Learned {
     pub state_values: Vec<f64>,
     /// N(s).
     pub state_visits: Vec<f64>,
+    /// w.
+    pub weights: Vec<f64>,
+    /// What the data leave open of them.
+    pub uncertainty: Option<Uncertainty>,
 }
 
 impl Learned {
@@ -56,7 +60,32 @@ impl Learned {
                     )
                 })
         };
+        let weights = array(&fit.weights, fit.weights.len() / 8, "weights")?;
+        let uncertainty = match &fit.posterior {
+            Some(posterior) => Some(Uncertainty::from_posterior(irl::Posterior {
+                standard_deviations: array(&posterior.standard_deviations, weights.len(), "standard_deviations")?,
+                low: array(&posterior.low, weights.len(), "low")?,
+                high: array(&posterior.high, weights.len(), "high")?,
+                diagnostics: match &posterior.diagnostics {
+                    Some(d) => Some(irl::Diagnostics {
+                        chains: d.chains,
+                        draws: d.draws,
+                        acceptance: d.acceptance,
+                        split_rhat: array(&d.split_rhat, weights.len(), "split_rhat")?,
+                        effective_sample_size: array(&d.effective_sample_size, weights.len(), "effective_sample_size")?,
+                    }),
+                    None => None,
+                },
+            })),
+            None if fit.standard_errors.is_empty() => None,
+            None => {
+                let errors = array(&fit.standard_errors, weights.len(), "standard_errors")?;
+                Some(Uncertainty::from_standard_errors(&weights, &errors))
+            }
+        };
         Ok(Self {
+            weights,
+            uncertainty,
             reward: array(&fit.reward, pairs, "reward")?,
             policy: array(&fit.policy, pairs, "policy")?,
             greedy_policy: array(&fit.greedy_policy, pairs, "greedy_policy")?,
@@ -84,6 +113,8 @@ pub struct Parts<'a> {
     pub learned: Learned,
     /// Roll-outs.
     pub judged: Judged,
+    /// What was asked beyond the fit.
+    pub answers: Answers,
     /// A picture of the environment, where it can be drawn.
     pub frame: Option<Vec<u8>>,
     /// What the fit makes of the features, where it weighs them.
@@ -99,7 +130,7 @@ pub struct Parts<'a> {
 /// # Errors
 /// A fit that the service describes wrongly.
 pub fn report(parts: Parts<'_>) -> Result<Report, CliError> {
-    let Parts { job, style, model, mdp, truth, fit, learned, judged, frame, features, sources, begun } = parts;
+    let Parts { job, style, model, mdp, truth, fit, learned, judged, answers, frame, features, sources, begun } = parts;
     let n_actions = model.n_actions as usize;
     let wrong = |error: &dyn std::fmt::Display| {
         CliError::failure(
@@ -143,6 +174,16 @@ pub fn report(parts: Parts<'_>) -> Result<Report, CliError> {
         sources,
         state_visits: learned.state_visits,
         states_covered: fit.states_covered,
+        weights: learned.weights,
+        weight_names: Vec::new(),
+        uncertainty: learned.uncertainty,
+        hyperparameters: fit
+            .hyperparameters
+            .into_iter()
+            .map(|h| irl::Hyperparameter { name: h.name, value: h.value })
+            .collect(),
+        validation: answers.validation,
+        transfer: answers.transfer,
         reward: learned.reward,
         policy: learned.policy,
         greedy_policy: learned.greedy_policy,

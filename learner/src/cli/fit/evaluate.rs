@@ -40,6 +40,11 @@ impl Judged {
 /// Summed info columns that describe a driver.
 const EVENTS: [&str; 4] = ["speed_mps", "collisions", "overtakes_left", "overtakes_right"];
 
+/// Whether an environment counts what drivers do.
+pub fn counts_events(spec: &EnvSpec) -> bool {
+    EVENTS.iter().all(|name| spec.info_columns.iter().any(|c| c.summed && c.name == *name))
+}
+
 /// Rolls out the expert and, where the environment counts what drivers do, the learned and a random one.
 ///
 /// # Errors
@@ -54,7 +59,7 @@ pub async fn judge(
 ) -> Result<Judged, CliError> {
     let evaluation =
         Evaluation { episodes: u64::from(job.rollouts), steps: u64::from(STEPS), seed: evaluation_seed(job.seed) };
-    let counts_events = EVENTS.iter().all(|name| spec.info_columns.iter().any(|c| c.summed && c.name == *name));
+    let counts_events = counts_events(spec);
     let runs = u64::from(expert.is_some()) + if counts_events { 2 } else { 0 };
     let bar = narrator.bar("judge", u64::from(job.rollouts) * runs);
     let drive = async |controller: Controller, totals_only: bool| {
@@ -112,7 +117,7 @@ fn pairs(episodes: &Episodes, n_actions: usize, n_pairs: usize) -> Vec<f64> {
 }
 
 /// Means per step with their confidence intervals over episodes; `None` where the environment counts no such events.
-fn metrics(episodes: &Episodes) -> Option<DriverMetrics> {
+pub fn metrics(episodes: &Episodes) -> Option<DriverMetrics> {
     let column = |name: &str| {
         let totals = episodes.total(name)?.iter().zip(&episodes.lengths);
         let samples: Vec<_> = totals.map(|(&total, &steps)| (total, f64::from(steps))).collect();

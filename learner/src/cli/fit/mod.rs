@@ -8,6 +8,7 @@ pub mod assemble;
 mod evaluate;
 mod imported;
 pub mod job;
+mod judge;
 pub mod learning;
 pub mod narrate;
 pub mod recordings;
@@ -18,6 +19,7 @@ pub use args::FitArgs;
 use super::{error::CliError, scene};
 use evaluate::Policies;
 use job::Job;
+use judge::{Extras, Fitted};
 use mazeway_client::Model;
 use mazeway_learner::report::{self, json, table::Terminal, write};
 use mazeway_proto::learner::FitRequest;
@@ -32,6 +34,7 @@ use std::{path::Path, time::Instant};
 /// Wrong usage, nothing to learn from, a service that fails, a report that cannot be written.
 pub async fn run(args: FitArgs) -> Result<(), CliError> {
     let job = Job::new(&args)?;
+    let extras = Extras::new(&args)?;
     let narrator = Narrator::new(args.json);
     if let Some(out) = &args.out {
         // A report that cannot be written is better known before the work than after it.
@@ -40,7 +43,7 @@ pub async fn run(args: FitArgs) -> Result<(), CliError> {
     }
     let services = Services::start(&args, narrator).await?;
     let outcome = tokio::select! {
-        outcome = fit(&args, &job, &services, narrator) => outcome,
+        outcome = fit(&args, &job, &extras, &services, narrator) => outcome,
         // Dropping the calls cancels them; what was acknowledged is stored.
         _ = tokio::signal::ctrl_c() => Err(CliError::failure(
             "interrupted",
@@ -51,7 +54,13 @@ pub async fn run(args: FitArgs) -> Result<(), CliError> {
     outcome.and(stopped)
 }
 
-async fn fit(args: &FitArgs, job: &Job, services: &Services, narrator: Narrator) -> Result<(), CliError> {
+async fn fit(
+    args: &FitArgs,
+    job: &Job,
+    extras: &Extras,
+    services: &Services,
+    narrator: Narrator,
+) -> Result<(), CliError> {
     let begun = Instant::now();
     let spec = match (&job.model, services.spec(&job.env_id).await) {
         (None, Ok(spec)) => spec,
@@ -91,6 +100,9 @@ async fn fit(args: &FitArgs, job: &Job, services: &Services, narrator: Narrator)
         let (episodes, steps) = (evaluation.episodes, evaluation.steps);
         narrator.step("judged", format_args!("{episodes} episodes of up to {steps} steps a driver"))?;
     }
+    let fitted =
+        Fitted { job, spec: &spec, style: &style, model: &model, mdp: &mdp, fit: &fit, learned: &learned };
+    let answers = judge::answer(extras, &fitted, services, narrator).await?;
     let frame = evaluate::frame(job, &learned.greedy_policy, policies.n_actions, services).await?;
     let sources = services.sources(&recordings).await?;
 
@@ -107,6 +119,7 @@ async fn fit(args: &FitArgs, job: &Job, services: &Services, narrator: Narrator)
         fit,
         learned,
         judged,
+        answers,
         frame: Some(frame),
         features: Vec::new(),
         sources,

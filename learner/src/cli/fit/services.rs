@@ -8,7 +8,9 @@ use crate::cli::{
     error::CliError,
     scene,
 };
-use mazeway_client::{Code, Connection, Env, EnvSpec, Episodes, Learner, Model, Rollout, SessionOptions};
+use mazeway_client::{
+    Code, Connection, Env, EnvSpec, Episodes, Learner, Model, Rollout, SessionOptions, packed::Packed,
+};
 use mazeway_learner::report::Source;
 use mazeway_proto::learner::{Fit, FitProgress, FitRequest, Trajectory, TrajectoryFilter};
 use std::{
@@ -152,6 +154,34 @@ impl Services {
         Ok(Env::create(self.environments()?, env_id, options).await?)
     }
 
+    /// The environment server.
+    pub fn environments(&self) -> &Connection {
+        &self.environments
+    }
+
+    /// Trajectories by id, in the order of the ids, all of which the filter selects.
+    ///
+    /// # Errors
+    /// The learner fails, or has lost one.
+    pub async fn trajectories(
+        &self,
+        filter: &TrajectoryFilter,
+        ids: &[String],
+    ) -> Result<Vec<mazeway_learner::trajectory::Trajectory>, CliError> {
+        let mut found = std::collections::HashMap::new();
+        let mut stream = self.learner.export_trajectories(filter).await?;
+        let wanted: std::collections::HashSet<&str> = ids.iter().map(String::as_str).collect();
+        while found.len() < wanted.len() {
+            let Some(part) = stream.next().await? else { break };
+            for trajectory in part.into_iter().filter(|trajectory| wanted.contains(trajectory.trajectory_id.as_str())) {
+                let checked = checked(&trajectory)?;
+                found.insert(trajectory.trajectory_id, checked);
+            }
+        }
+        let lost = || CliError::failure("the trajectories of the fit are gone", "see what is stored with 'learner list'");
+        ids.iter().map(|id| found.remove(id).ok_or_else(lost)).collect()
+    }
+
     /// How many recordings a filter selects.
     ///
     /// # Errors
@@ -206,6 +236,31 @@ impl Services {
         }
         Ok(counts.into_iter().map(|(name, trajectories)| Source { name, trajectories }).collect())
     }
+}
+
+/// A trajectory as the mathematics takes it.
+fn checked(trajectory: &Trajectory) -> Result<mazeway_learner::trajectory::Trajectory, CliError> {
+    let broken = |message: String| {
+        CliError::failure(message, "the learner is of another release, or its data directory is damaged")
+    };
+    let array = |bytes: &prost::bytes::Bytes| {
+        Packed::<u32>::new(bytes.clone())
+            .map(|packed| packed.to_vec())
+            .ok_or_else(|| broken(format!("trajectory {} has a torn array", trajectory.trajectory_id)))
+    };
+    let (states, actions) = (array(&trajectory.states)?, array(&trajectory.actions)?);
+    let checked = if actions.is_empty() {
+        mazeway_learner::trajectory::Trajectory::states_only(states, trajectory.final_state, trajectory.n_states)
+    } else {
+        mazeway_learner::trajectory::Trajectory::new(
+            states,
+            actions,
+            trajectory.final_state,
+            trajectory.n_states,
+            trajectory.n_actions,
+        )
+    };
+    checked.map_err(|error| broken(format!("trajectory {}: {error}", trajectory.trajectory_id)))
 }
 
 /// The same host at the environment server's usual port.

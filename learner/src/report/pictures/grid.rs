@@ -1,7 +1,7 @@
 //! Environments on a grid: visits, rewards, values and policies over the cells; Hahn & Zoubir (2015), Fig. 1.
 
 use super::canvas::{Canvas, Type, text_width};
-use super::colour::{DIFFERS, INK, RULE, Scale, WALL};
+use super::colour::{DIFFERS, INK, MUTED, RULE, Scale, WALL};
 use super::panel::{BAR, MARGIN, TITLE, WIDTH, bar, not_visited, title};
 use super::{Part, Picture};
 use crate::report::format::{alike, count, unit};
@@ -104,6 +104,24 @@ fn panels(report: &Report) -> Vec<Panel> {
             hatch: true,
         },
     });
+    if let Some(uncertainty) = report.uncertainty.as_ref().filter(|_| report.weights.len() == report.states()) {
+        let widths: Vec<f64> = (0..report.states()).map(|state| uncertainty.width(state)).collect();
+        panels.push(Panel {
+            name: "uncertainty",
+            part: Part::Learned,
+            title: "What is open",
+            note: "width of the 95 % interval of each state's reward".into(),
+            caption: "How far apart the ends of each reward's 95 % interval lie: darker is less certain, a question mark is a \
+                      reward that the demonstrations do not determine at all."
+                .into(),
+            content: Content::Heat {
+                scale: Scale::from_zero(widths.iter().copied()),
+                values: widths,
+                bar: "width of the interval",
+                hatch: true,
+            },
+        });
+    }
     if let Some(truth) = report.true_state_reward() {
         panels.push(Panel {
             name: "true_reward",
@@ -209,8 +227,11 @@ fn paint(canvas: &Canvas<'_>, report: &Report, geometry: &Geometry, panel: &Pane
                     canvas.hatch(x, y, cell, cell);
                 }
                 let text = if whole { count(value) } else { write(value / factor) };
+                if value.is_infinite() {
+                    canvas.text(x + cell / 2.0, y + cell / 2.0, "?", Type::new(13.0).centred().bold().colour(MUTED));
+                }
                 // Zeros are left to the eye: a field of them hides the rest.
-                if value != 0.0 && text_width(&text, 11.0) < cell - 2.0 {
+                if value.is_finite() && value != 0.0 && text_width(&text, 11.0) < cell - 2.0 {
                     if hatched {
                         canvas.rect(x + 2.0, y + cell / 2.0 - 7.5, cell - 4.0, 15.0, scale.colour(value));
                     }

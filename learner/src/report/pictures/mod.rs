@@ -1,7 +1,8 @@
 //! Pictures of a report as SVG, and as PNG from those.
 //!
 //! A picture is a white card 400 units wide, which a phone shows whole, or a sheet of several. Colours mean the same on
-//! all of them: darker is more, hatched was not visited by the demonstrations, tinted differs from what is known to be right.
+//! all of them: darker is more, hatched was not visited by the demonstrations, tinted differs from what is known to be right, and a
+//! question mark is what the data do not determine.
 
 mod bands;
 mod canvas;
@@ -10,6 +11,7 @@ mod features;
 mod finite;
 mod grid;
 mod highway;
+mod judged;
 mod panel;
 mod raster;
 mod trace;
@@ -60,6 +62,7 @@ pub fn all(report: &Report) -> Result<Vec<Picture>, ReportError> {
         pictures.extend(finite::pictures(report, !report.is_highway())?);
     }
     pictures.extend(features::picture(report)?);
+    pictures.extend(judged::pictures(report)?);
     pictures.extend(trace::picture(report)?);
     Ok(pictures)
 }

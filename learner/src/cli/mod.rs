@@ -12,6 +12,7 @@ pub mod fit;
 mod import;
 mod list;
 mod models;
+mod reproduce;
 mod scene;
 mod serve;
 mod show;
@@ -39,6 +40,8 @@ enum Command {
     Compare(Box<compare::CompareArgs>),
     /// Store a model and demonstrations from files
     Import(Box<import::ImportArgs>),
+    /// Draw the paper's figures, its experiment with three styles, its weak points, and transfer to other models
+    Reproduce(reproduce::ReproduceArgs),
     /// List recordings, models and fits
     List(list::ListArgs),
     /// Show a fit, a trajectory or a model
@@ -110,6 +113,7 @@ async fn run(command: Command) -> Result<(), CliError> {
         Command::Fit(args) => fit::run(*args).await,
         Command::Compare(args) => compare::run(*args).await,
         Command::Import(args) => import::run(*args).await,
+        Command::Reproduce(args) => Box::pin(reproduce::run(args)).await,
         Command::List(args) => list::run(args).await,
         Command::Show(args) => show::run(args).await,
         Command::Export(args) => export::export(args).await,

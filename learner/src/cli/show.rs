@@ -12,6 +12,7 @@ use super::{
 use clap::Args;
 use mazeway_client::{ClientError, Code, Learner, packed::Packed};
 use mazeway_learner::files::Names;
+use mazeway_learner::report::uncertainty::Uncertainty;
 use mazeway_proto::learner as pb;
 use serde_json::{Value, json};
 use std::io::Write as _;
@@ -267,7 +268,34 @@ fn fit_text(fit: &pb::Fit, names: &(Names, Names)) -> Result<String, CliError> {
     text.push_str(&table([state, "#visits", "#value", "greedy action", "#its reward", "#its probability"], rows));
     text.push('\n');
     text.push_str(&rest(s));
+    text.push_str(&weights_text(fit)?);
     Ok(text)
+}
+
+/// The weights with what the data leave open of them; nothing where the method does not say.
+fn weights_text(fit: &pb::Fit) -> Result<String, CliError> {
+    let n = fit.weights.len() / 8;
+    let weights = array(&fit.weights, n, "weights")?;
+    let uncertainty = match &fit.posterior {
+        Some(posterior) => Uncertainty::from_posterior(mazeway_learner::irl::Posterior {
+            standard_deviations: array(&posterior.standard_deviations, n, "standard deviations")?,
+            low: array(&posterior.low, n, "lower ends")?,
+            high: array(&posterior.high, n, "upper ends")?,
+            diagnostics: None,
+        }),
+        None if fit.standard_errors.is_empty() => return Ok(String::new()),
+        None => Uncertainty::from_standard_errors(&weights, &array(&fit.standard_errors, n, "standard errors")?),
+    };
+    let rows = (0..n.min(MOST_ROWS)).map(|weight| {
+        let (sd, low, high) =
+            (uncertainty.standard_deviations[weight], uncertainty.low[weight], uncertainty.high[weight]);
+        let interval =
+            if uncertainty.determined(weight) { format!("{low:.4} to {high:.4}") } else { "not determined".to_owned() };
+        let sd = if sd.is_finite() { format!("{sd:.4}") } else { "∞".to_owned() };
+        [weight.to_string(), format!("{:.4}", weights[weight]), sd, interval]
+    });
+    let table = table(["#weight", "#estimate", "#standard deviation", "#95% interval"], rows);
+    Ok(format!("\n{table}\n{}", rest(n)))
 }
 
 /// Says what a table leaves out.

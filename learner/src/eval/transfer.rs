@@ -127,10 +127,7 @@ mod tests {
         assert_eq!(matching.unmatched(), 1);
         assert_eq!(matching.reward(&[1.0, 2.0, 3.0, 4.0, 5.0, 6.0]), [3.0, 4.0, 5.0, 6.0, 1.0, 2.0, 1.0, 2.0]);
         assert_eq!(matching.policy(&[1.0, 0.0, 0.0, 1.0, 1.0, 0.0])[4..6], [0.5, 0.5]);
-        assert_eq!(
-            Matching::new((&small, &labels), (&large, &[])),
-            Err(MatchError::States { expected: 3, got: 4 })
-        );
+        assert_eq!(Matching::new((&small, &labels), (&large, &[])), Err(MatchError::States { expected: 3, got: 4 }));
         let strange = vec!["x".to_owned(), "y".to_owned(), "z".to_owned()];
         assert_eq!(Matching::new((&small, &labels), (&small, &strange)), Err(MatchError::Disjoint));
     }

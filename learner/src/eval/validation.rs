@@ -136,8 +136,7 @@ fn one(
     let statistics = builder.finish().map_err(|e| data(&e))?;
     let demonstrations =
         Demonstrations::new(of_fold(false).map(|(_, trajectory)| trajectory.truncated(horizon)).collect());
-    let problem =
-        Problem { mdp, options, statistics: &statistics, demonstrations: Some(&demonstrations), features };
+    let problem = Problem { mdp, options, statistics: &statistics, demonstrations: Some(&demonstrations), features };
     let fit = irl::fit(method, &problem, &mut |_| ControlFlow::Continue(()))
         .map_err(|error| ValidationError::Fit { fold, error })?;
     let mut part = Part { scores: Vec::new(), calibration: CalibrationBuilder::default() };
@@ -200,8 +199,8 @@ mod tests {
         let mdp = TabularMdp::new(1, 2, vec![0, 1, 2], vec![0, 0], vec![1.0; 2], None).expect("a model");
         let bc = irl::method("bc").expect("a method");
         for folds in [0, 1, 5] {
-            let error =
-                cross_validate(bc, (&mdp, None), &FitOptions::default(), &trajectories(&[0, 1, 0, 1]), folds).expect_err("refused");
+            let error = cross_validate(bc, (&mdp, None), &FitOptions::default(), &trajectories(&[0, 1, 0, 1]), folds)
+                .expect_err("refused");
             assert_eq!(error, ValidationError::Folds { folds, trajectories: 4 });
         }
     }

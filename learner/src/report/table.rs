@@ -96,8 +96,8 @@ fn weights(report: &Report, terminal: Terminal) -> Option<String> {
     for &weight in &shown {
         let sd = uncertainty.standard_deviations[weight];
         let sd = if sd.is_finite() { brief(sd) } else { "∞".to_owned() };
-        let row =
-            [report.weight_name(weight, 60), brief(report.weights[weight]), sd, uncertainty.interval(weight)].map(Cell::new);
+        let row = [report.weight_name(weight, 60), brief(report.weights[weight]), sd, uncertainty.interval(weight)]
+            .map(Cell::new);
         table.add_row(row.map(|cell| if uncertainty.determined(weight) { cell } else { cell.fg(Color::DarkGrey) }));
     }
     right_align(&mut table, 1..4);

@@ -10,6 +10,9 @@ use crate::irl::{Diagnostics, Posterior};
 /// Standard normal quantile of 0.975.
 const Z: f64 = 1.959_963_984_540_054;
 
+/// A standard error of so many times the largest weight says nothing.
+pub const HOPELESS: f64 = 1e3;
+
 /// Intervals of the weights.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Uncertainty {
@@ -35,9 +38,13 @@ pub enum UncertaintySource {
 }
 
 impl Uncertainty {
-    /// Normal intervals from standard errors, of which those that are no number are not determined.
+    /// Normal intervals from standard errors. Those that are no number are not determined, and so are those of more than
+    /// [`HOPELESS`] times the largest weight: a Hessian that is singular but for rounding.
     pub fn from_standard_errors(weights: &[f64], standard_errors: &[f64]) -> Self {
-        let sd: Vec<f64> = standard_errors.iter().map(|&se| if se.is_finite() { se } else { f64::INFINITY }).collect();
+        let most = weights.iter().filter(|w| w.is_finite()).fold(0.0, |most: f64, w| most.max(w.abs()));
+        let limit = if most > 0.0 { HOPELESS * most } else { f64::INFINITY };
+        let known = |se: f64| if se.is_finite() && se <= limit { se } else { f64::INFINITY };
+        let sd: Vec<f64> = standard_errors.iter().map(|&se| known(se)).collect();
         let end = |sign: f64| weights.iter().zip(&sd).map(|(w, sd)| w + sign * Z * sd).collect();
         Self {
             source: UncertaintySource::StandardErrors,
@@ -160,7 +167,7 @@ mod tests {
 
     #[test]
     fn what_is_not_determined_is_called_so() {
-        let uncertainty = Uncertainty::from_standard_errors(&[1.0, 2.0, 3.0], &[0.5, f64::NAN, f64::INFINITY]);
+        let uncertainty = Uncertainty::from_standard_errors(&[1.0, 2.0, 3.0], &[0.5, f64::NAN, 4e3]);
         assert_eq!(uncertainty.undetermined(), 2);
         assert!((uncertainty.low[0] - 0.02).abs() < 1e-3 && (uncertainty.high[0] - 1.98).abs() < 1e-3);
         assert_eq!(uncertainty.interval(1), "not determined");

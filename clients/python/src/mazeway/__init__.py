@@ -32,7 +32,7 @@ from mazeway.errors import (
     UnsupportedError,
     WrongStateError,
 )
-from mazeway.fit import Fit, FitSummary, ModelSummary, Progress
+from mazeway.fit import Fit, FitSummary, ModelSummary, Posterior, Progress
 from mazeway.learner import Learner
 from mazeway.model import Model
 from mazeway.recorder import Recorder
@@ -58,6 +58,7 @@ __all__ = [
     "Model",
     "ModelSummary",
     "NotFoundError",
+    "Posterior",
     "Progress",
     "Recorder",
     "ResetNeededError",

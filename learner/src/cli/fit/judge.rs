@@ -103,7 +103,10 @@ pub async fn answer(
             let validated = tokio::task::spawn_blocking(move || {
                 let method = irl::method(method).ok_or_else(|| wrong(&"unknown method"))?;
                 cross_validate(method, (&mdp, None), &options, &data, folds).map_err(|error| {
-                    CliError::failure(format!("cannot cross-validate: {error}"), "choose another number of --folds, or none")
+                    CliError::failure(
+                        format!("cannot cross-validate: {error}"),
+                        "choose another number of --folds, or none",
+                    )
                 })
             });
             let validation = validated.await.map_err(|error| wrong(&error))??;
@@ -138,7 +141,9 @@ async fn transfer(
     let target_mdp = scene::checked(&target)?;
     let truth = scene::truth(job.discount(), fitted.style, &target, &target_mdp)?;
     let matching = Matching::new((fitted.mdp, &fitted.model.state_labels), (&target_mdp, &target.state_labels))
-        .map_err(|error| CliError::failure(error.to_string(), "plan in a model with the same actions and labelled states"))?;
+        .map_err(|error| {
+            CliError::failure(error.to_string(), "plan in a model with the same actions and labelled states")
+        })?;
 
     let plan_options =
         PlanOptions { discount: options.discount, horizon: options.horizon, horizon_prior: options.horizon_prior };

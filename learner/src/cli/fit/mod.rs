@@ -26,24 +26,36 @@ use mazeway_proto::learner::FitRequest;
 use narrate::Narrator;
 use recordings::{Expert, Recordings};
 use services::Services;
-use std::{path::Path, time::Instant};
+use std::{
+    path::{Path, PathBuf},
+    time::Instant,
+};
 
 /// Fits and reports.
 ///
 /// # Errors
 /// Wrong usage, nothing to learn from, a service that fails, a report that cannot be written.
 pub async fn run(args: FitArgs) -> Result<(), CliError> {
-    let job = Job::new(&args)?;
-    let extras = Extras::new(&args)?;
     let narrator = Narrator::new(args.json);
+    let (report, out) = make(&args, narrator).await?;
+    show(&report, &out, args.json, narrator)
+}
+
+/// Fits; returns the report and the directory that it is meant for, which may not be there yet.
+///
+/// # Errors
+/// Wrong usage, nothing to learn from, a service that fails.
+pub async fn make(args: &FitArgs, narrator: Narrator) -> Result<(report::Report, PathBuf), CliError> {
+    let job = Job::new(args)?;
+    let extras = Extras::new(args)?;
     if let Some(out) = &args.out {
         // A report that cannot be written is better known before the work than after it.
         std::fs::create_dir_all(out)
             .map_err(|error| cannot_write(format!("cannot make {}: {error}", out.display())))?;
     }
-    let services = Services::start(&args, narrator).await?;
+    let services = Services::start(args, narrator).await?;
     let outcome = tokio::select! {
-        outcome = fit(&args, &job, &extras, &services, narrator) => outcome,
+        outcome = fit(args, &job, &extras, &services, narrator) => outcome,
         // Dropping the calls cancels them; what was acknowledged is stored.
         _ = tokio::signal::ctrl_c() => Err(CliError::failure(
             "interrupted",
@@ -51,7 +63,7 @@ pub async fn run(args: FitArgs) -> Result<(), CliError> {
         )),
     };
     let stopped = services.stop().await;
-    outcome.and(stopped)
+    outcome.and_then(|made| stopped.map(|()| made))
 }
 
 async fn fit(
@@ -60,7 +72,7 @@ async fn fit(
     extras: &Extras,
     services: &Services,
     narrator: Narrator,
-) -> Result<(), CliError> {
+) -> Result<(report::Report, PathBuf), CliError> {
     let begun = Instant::now();
     let spec = match (&job.model, services.spec(&job.env_id).await) {
         (None, Ok(spec)) => spec,
@@ -125,7 +137,7 @@ async fn fit(
         sources,
         begun,
     })?;
-    show(&report, &out, args.json, narrator)
+    Ok((report, out))
 }
 
 /// Fits on the recordings, with a bar while it runs.

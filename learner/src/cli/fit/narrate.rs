@@ -22,6 +22,11 @@ impl Narrator {
         Self { quiet: json, bars: io::stdout().is_terminal() && io::stderr().is_terminal() }
     }
 
+    /// Shows bars and tells nothing.
+    pub fn quiet() -> Self {
+        Self { quiet: true, ..Self::new(true) }
+    }
+
     /// One thing that was done.
     pub fn step(self, what: &str, detail: impl std::fmt::Display) -> io::Result<()> {
         self.line(format_args!("{what:<12}{detail}"))

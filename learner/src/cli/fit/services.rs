@@ -178,7 +178,8 @@ impl Services {
                 found.insert(trajectory.trajectory_id, checked);
             }
         }
-        let lost = || CliError::failure("the trajectories of the fit are gone", "see what is stored with 'learner list'");
+        let lost =
+            || CliError::failure("the trajectories of the fit are gone", "see what is stored with 'learner list'");
         ids.iter().map(|id| found.remove(id).ok_or_else(lost)).collect()
     }
 

@@ -3,6 +3,7 @@
 use super::canvas::{Canvas, Type, fit, text_width};
 use super::colour::{ACCENT, INK, MUTED, RULE};
 use super::panel::{MARGIN, TITLE, WIDTH, title};
+use super::trace::tick;
 use super::{Part, Picture};
 use crate::report::format::{brief, count};
 use crate::report::uncertainty::UncertaintySource;
@@ -35,7 +36,10 @@ fn weights(report: &Report) -> Result<Option<Picture>, ReportError> {
     let left = MARGIN + (longest + 10.0).min(NAMES);
     let right = WIDTH - MARGIN;
     let ends = |w: usize| [report.weights[w], uncertainty.low[w], uncertainty.high[w]];
-    let finite = shown.iter().filter(|&&w| uncertainty.determined(w)).flat_map(|&w| ends(w)).filter(|x| x.is_finite());
+    // A few very long bars must not make all the others points: they are cut off at the edge.
+    let most = shown.iter().map(|&w| report.weights[w].abs()).filter(|w| w.is_finite()).fold(0.0, f64::max);
+    let edge = if most > 0.0 { 4.0 * most } else { f64::INFINITY };
+    let finite = shown.iter().flat_map(|&w| ends(w)).filter(|x| x.is_finite()).map(|x| x.clamp(-edge, edge));
     let (low, high) = finite.fold((0.0_f64, 0.0_f64), |(low, high), x| (low.min(x), high.max(x)));
     let span = if high > low { high - low } else { 1.0 };
     let x = |value: f64| left + 6.0 + (right - left - 12.0) * ((value - low) / span).clamp(0.0, 1.0);
@@ -50,7 +54,7 @@ fn weights(report: &Report) -> Result<Option<Picture>, ReportError> {
     let svg = Canvas::draw("weights", (WIDTH, TITLE + height + 40.0), &format!("Weights: {note}"), |canvas| {
         title(canvas, MARGIN, 0.0, WIDTH - 2.0 * MARGIN, "Weights and what is open", &note);
         let foot = TITLE + height;
-        for value in [low, 0.0, high] {
+        for value in [low, 0.0, high].into_iter().filter(|&v| v == 0.0 || (x(v) - x(0.0)).abs() > 30.0) {
             canvas.path(&[(x(value), TITLE), (x(value), foot)], RULE, 0.8);
             canvas.text(x(value), foot + 14.0, &brief(value), Type::new(SET).centred().colour(MUTED));
         }
@@ -62,13 +66,16 @@ fn weights(report: &Report) -> Result<Option<Picture>, ReportError> {
             canvas.text(left - 8.0, y, &name, Type::new(SET).right().colour(colour));
             if determined {
                 let (from, to) = (x(uncertainty.low[weight]), x(uncertainty.high[weight]));
-                let mut bar = vec![(from, y - 3.0), (from, y + 3.0), (from, y), (to, y), (to, y - 3.0), (to, y + 3.0)];
-                bar.dedup();
-                canvas.path(&bar, ACCENT, 1.3);
+                canvas.path(&[(from, y), (to, y)], ACCENT, 1.3);
+                for (end, value) in [(from, uncertainty.low[weight]), (to, uncertainty.high[weight])] {
+                    if value >= low && value <= high {
+                        canvas.path(&[(end, y - 3.0), (end, y + 3.0)], ACCENT, 1.3);
+                    }
+                }
                 canvas.disc(x(report.weights[weight]), y, 3.0, ACCENT.mix(1.0));
             } else {
                 let mut at = left + 6.0;
-                while at < right - 4.0 {
+                while at < right - 82.0 {
                     canvas.path(&[(at, y), (at + 3.0, y)], MUTED, 1.0);
                     at += 8.0;
                 }
@@ -77,9 +84,10 @@ fn weights(report: &Report) -> Result<Option<Picture>, ReportError> {
         }
         canvas.path(&[(x(0.0), TITLE), (x(0.0), foot)], MUTED, 0.8);
     })?;
-    let caption = "The weights of the reward with their 95 % intervals. A long bar is a weight of which the demonstrations say \
+    let caption =
+        "The weights of the reward with their 95 % intervals. A long bar is a weight of which the demonstrations say \
                    little, a dotted line one of which they say nothing."
-        .to_owned();
+            .to_owned();
     Ok(Some(Picture { name: "weights", part: Part::Learned, title: "Weights and what is open", caption, svg }))
 }
 
@@ -104,12 +112,12 @@ fn calibration(report: &Report) -> Result<Option<Picture>, ReportError> {
             let (x, y) = (left + side * share, foot - side * share);
             canvas.path(&[(left, y), (right, y)], RULE, 0.7);
             canvas.path(&[(x, top), (x, foot)], RULE, 0.7);
-            canvas.text(left - 7.0, y, &brief(share), muted.right());
-            canvas.text(x, foot + 13.0, &brief(share), muted.centred());
+            canvas.text(left - 9.0, y, &tick(share), muted.right());
+            canvas.text(x, foot + 16.0, &tick(share), muted.centred());
         }
         canvas.path(&[(left, foot), (right, top)], MUTED, 1.0);
-        canvas.text(f64::midpoint(left, right), foot + 32.0, "predicted probability", muted.centred());
-        canvas.text(MARGIN + 4.0, f64::midpoint(top, foot), "share that came true", muted.centred().upright());
+        canvas.text(f64::midpoint(left, right), foot + 35.0, "predicted probability", muted.centred());
+        canvas.text(MARGIN - 4.0, f64::midpoint(top, foot), "share that came true", muted.centred().upright());
         let most = calibration.bins.iter().map(|bin| bin.predictions).max().unwrap_or(1).max(1) as f64;
         let points: Vec<_> = calibration.bins.iter().filter(|bin| bin.predictions > 0).collect();
         let at = |predicted: f64, observed: f64| (left + side * predicted, foot - side * observed);
@@ -122,8 +130,9 @@ fn calibration(report: &Report) -> Result<Option<Picture>, ReportError> {
             canvas.disc(x, y, 3.0 + 6.0 * (bin.predictions as f64 / most).sqrt(), ACCENT.mix(0.85));
         }
     })?;
-    let caption = "How often actions predicted with a probability were taken, on trajectories that the fit did not see; on the \
+    let caption =
+        "How often actions predicted with a probability were taken, on trajectories that the fit did not see; on the \
                    diagonal predictions come true. Large dots are many predictions."
-        .to_owned();
+            .to_owned();
     Ok(Some(Picture { name: "calibration", part: Part::Fit, title: "Calibration", caption, svg }))
 }

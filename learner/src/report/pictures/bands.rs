@@ -14,8 +14,8 @@ use plotters::style::{Color, RGBColor};
 
 /// Size of a sheet.
 const SIZE: (f64, f64) = (720.0, 440.0);
-/// Room for the names at the right.
-const NAMES: f64 = 148.0;
+/// Room for the names at the right, at least and at most.
+const NAMES: (f64, f64) = (128.0, 250.0);
 /// Room for the numbers at the left.
 const LABELS: f64 = 44.0;
 /// Below this an expected value difference is drawn at the foot of a logarithmic axis.
@@ -136,7 +136,9 @@ fn picture(comparison: &Comparison, what: &str, measure: &Measure) -> Result<Opt
 }
 
 fn chart(canvas: &Canvas<'_>, lines: &[Line<'_>], axis: &Axis) {
-    let (left, right) = (MARGIN + LABELS, SIZE.0 - MARGIN - NAMES);
+    let longest = lines.iter().map(|line| text_width(line.name, 12.0)).fold(0.0, f64::max);
+    let room = (longest + 40.0).clamp(NAMES.0, NAMES.1);
+    let (left, right) = (MARGIN + LABELS, SIZE.0 - MARGIN - room);
     let (ceiling, foot) = (TITLE + 12.0, SIZE.1 - 52.0);
     let muted = Type::new(11.0).colour(MUTED);
     let mut across: Vec<f64> = lines.iter().flat_map(|line| line.points.iter().map(|&(l, _)| l)).collect();
@@ -217,7 +219,7 @@ fn names(
         canvas.path(&[(left, y), (left + 12.0, y)], line.hue, if line.baseline { 3.0 } else { 1.7 });
         let set = Type::new(12.0).colour(INK);
         let set = if line.baseline { set.bold() } else { set };
-        canvas.text(left + 17.0, y, &fit(line.name, 12.0, NAMES - 34.0), set);
+        canvas.text(left + 17.0, y, &fit(line.name, 12.0, SIZE.0 - left - 17.0 - 4.0), set);
     }
 }
 

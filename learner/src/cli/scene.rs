@@ -21,6 +21,8 @@ use mazeway_learner::{
 pub struct Environments {
     /// Connection to it.
     pub connection: Connection,
+    /// Where it listens.
+    pub address: String,
     embedded: Option<Embedded>,
 }
 
@@ -45,7 +47,7 @@ impl Environments {
                 format!("start one with 'server --listen {address}', or leave out --env-addr"),
             )
         })?;
-        Ok(Self { connection, embedded })
+        Ok(Self { connection, address, embedded })
     }
 
     /// Stops what was started.

@@ -64,6 +64,8 @@ const CLOSED: &str =
 /// Where results go, and what was told so far.
 struct Run {
     out: PathBuf,
+    /// One for all, so that each model is estimated once.
+    environments: Environments,
     narrator: Narrator,
     text: String,
 }
@@ -85,6 +87,8 @@ impl Run {
             self.out.join("recordings").into_os_string(),
             "--out".into(),
             directory.clone().into_os_string(),
+            "--env-addr".into(),
+            self.environments.address.clone().into(),
         ];
         let args = Fit::try_parse_from(typed.chain(places)).map_err(|error| internal(&error))?.args;
         let (report, _) = fit::make(&args, Narrator::quiet()).await?;
@@ -106,12 +110,8 @@ impl Run {
             .args;
         let job = compare::job::Job::new(&args)?;
         let directory = self.out.join(name);
-        let environments = Environments::start(None).await?;
-        let compared =
-            compare::compare(&job, &environments.connection, Narrator::quiet(), |_| Ok(directory.clone())).await;
-        let stopped = environments.stop().await;
-        let (comparison, _) = compared?;
-        stopped?;
+        let connection = &self.environments.connection;
+        let (comparison, _) = compare::compare(&job, connection, Narrator::quiet(), |_| Ok(directory.clone())).await?;
         compare::output::write(&job, &comparison, &directory)?;
         let table = compare::output::table(&job, &comparison);
         Ok((comparison, table))
@@ -133,16 +133,22 @@ pub async fn run(args: ReproduceArgs) -> Result<(), CliError> {
             "choose a directory that you may write to with --out DIR",
         )
     })?;
-    let mut run = Run { out, narrator: Narrator::new(false), text: String::new() };
-    figure1(&mut run).await?;
-    figure2(&mut run, &args).await?;
-    figure3(&mut run, &args).await?;
-    weak_points(&mut run, &args).await?;
-    transfer(&mut run, &args).await?;
+    let environments = Environments::start(None).await?;
+    let mut run = Run { out, environments, narrator: Narrator::new(false), text: String::new() };
+    let outcome = draw(&mut run, &args).await;
+    let stopped = run.environments.stop().await;
+    outcome.and(stopped)
+}
+
+async fn draw(run: &mut Run, args: &ReproduceArgs) -> Result<(), CliError> {
+    figure1(run).await?;
+    figure2(run, args).await?;
+    figure3(run, args).await?;
+    weak_points(run, args).await?;
+    transfer(run, args).await?;
     let written =
         write::replace(&run.out, "reproduce.txt", run.text.as_bytes()).map_err(|error| cannot_write(&error))?;
-    run.narrator.step("wrote", written.display())?;
-    Ok(())
+    Ok(run.narrator.step("wrote", written.display())?)
 }
 
 /// The maze: estimated reward and learned policy, by the paper's algorithm and by the default.

@@ -51,6 +51,9 @@ pub struct FitArgs {
     /// Cross-validate over so many folds of the trajectories: held-out log-likelihood, agreement and calibration
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(2..=10_000), help_heading = "Judging")]
     pub folds: Option<u32>,
+    /// Plan on the learned reward in this stored model too, by the beginning of its id; its states are matched by label
+    #[arg(long, value_name = "MODEL", help_heading = "Judging", conflicts_with_all = ["plan_in_options", "plan_in_layout"])]
+    pub plan_in: Option<String>,
     /// Plan on the learned reward in the environment under this option too, such as density=6; may be given several times
     #[arg(long = "plan-in-option", value_name = "KEY=VALUE", help_heading = "Judging")]
     pub plan_in_options: Vec<String>,

@@ -132,6 +132,7 @@ pub struct Parts<'a> {
 pub fn report(parts: Parts<'_>) -> Result<Report, CliError> {
     let Parts { job, style, model, mdp, truth, fit, learned, judged, answers, frame, features, sources, begun } = parts;
     let n_actions = model.n_actions as usize;
+    let n_weights = learned.weights.len();
     let wrong = |error: &dyn std::fmt::Display| {
         CliError::failure(
             format!("the service describes its fit wrongly: {error}"),
@@ -175,7 +176,11 @@ pub fn report(parts: Parts<'_>) -> Result<Report, CliError> {
         state_visits: learned.state_visits,
         states_covered: fit.states_covered,
         weights: learned.weights,
-        weight_names: Vec::new(),
+        weight_names: model
+            .features
+            .as_ref()
+            .filter(|table| table.names.len() == n_weights)
+            .map_or_else(Vec::new, |table| table.names.clone()),
         uncertainty: learned.uncertainty,
         hyperparameters: fit
             .hyperparameters

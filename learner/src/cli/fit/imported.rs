@@ -8,33 +8,34 @@ use super::{
     directory_name,
     evaluate::Judged,
     job::{AskedModel, Job, Source},
+    judge::{self, Extras, Fitted},
     learn,
     narrate::Narrator,
     recordings::Recordings,
     services::Services,
-    show,
 };
 use crate::cli::{error::CliError, models, scene};
 use mazeway_client::{Code, FeatureDomain, Learner, Model, packed::Packed};
 use mazeway_learner::{
     files::Names,
     mdp::{Policy, TabularMdp, TransitionCounts, finite_horizon_occupancy, state_action_occupancy},
-    report::{FeatureRow, Interval},
+    report::{FeatureRow, Interval, Report},
 };
 use mazeway_proto::learner::{Fit, TrajectoryFilter};
-use std::{collections::BTreeSet, time::Instant};
+use std::{collections::BTreeSet, path::PathBuf, time::Instant};
 
 /// Recordings that are asked for at a time.
 const PAGE: u32 = 10_000;
 
-/// Fits and reports.
+/// Fits; returns the report and the directory that it is meant for.
 pub async fn fit(
     args: &FitArgs,
     job: &Job,
+    extras: &Extras,
     services: &Services,
     narrator: Narrator,
     begun: Instant,
-) -> Result<(), CliError> {
+) -> Result<(Report, PathBuf), CliError> {
     let learner = services.learner();
     let style = style(job, learner).await?;
     let spinner = narrator.spinner("model");
@@ -69,6 +70,8 @@ pub async fn fit(
     let seen = pair_counts(&fit, &recordings, &mdp, learner).await?;
     let longest = seen.1;
     let features = features(&model, &mdp, &fit, &learned, seen)?;
+    let fitted = Fitted { job, spec: None, style: &style, model: &model, mdp: &mdp, fit: &fit, learned: &learned };
+    let answers = judge::answer(extras, &fitted, services, narrator).await?;
     let sources = services.sources(&recordings).await?;
     let out = match &args.out {
         Some(out) => out.clone(),
@@ -83,13 +86,14 @@ pub async fn fit(
         fit,
         learned,
         judged: Judged::NONE,
+        answers,
         frame: None,
         features,
         sources,
         begun,
     })?;
     report.horizon = longest;
-    show(&report, &out, args.json, narrator)
+    Ok((report, out))
 }
 
 /// The style that is asked for, or the only one that is recorded.

@@ -12,8 +12,8 @@ use super::{
     recordings::{Expert, evaluation_seed},
     services::Services,
 };
-use crate::cli::{compare::job::env_options, error::CliError, scene};
-use mazeway_client::{Controller, EnvSpec, Model, Options, Rollout};
+use crate::cli::{compare::job::env_options, error::CliError, models, scene};
+use mazeway_client::{Controller, EnvSpec, FeatureDomain, Model, Options, Rollout};
 use mazeway_learner::{
     eval::{
         self,
@@ -21,7 +21,7 @@ use mazeway_learner::{
         validation::{Validation, cross_validate},
     },
     irl::{self, FitOptions, Problem},
-    mdp::{PlanOptions, PlannerKind, Policy, TabularMdp, plan},
+    mdp::{Features, PlanOptions, PlannerKind, Policy, TabularMdp, plan},
     report::{Transfer, TransferRow},
     statistics::Statistics,
     trajectory::{Demonstrations, Trajectory},
@@ -34,8 +34,17 @@ use std::ops::ControlFlow;
 pub struct Extras {
     /// Folds of the cross-validation.
     pub folds: Option<u32>,
-    /// Options of the environment in which the reward is planned on anew.
-    pub plan_in: Option<Options>,
+    /// Where the reward is planned on anew.
+    pub plan_in: Option<PlanIn>,
+}
+
+/// Where a reward is planned on anew.
+#[derive(Debug, Clone)]
+pub enum PlanIn {
+    /// In the environment under other options.
+    Options(Options),
+    /// In a stored model, by the beginning of its id.
+    Model(String),
 }
 
 /// Both answers.
@@ -54,8 +63,11 @@ impl Extras {
     /// Malformed options, a layout that cannot be read: usage errors.
     pub fn new(args: &FitArgs) -> Result<Self, CliError> {
         let asked = !args.plan_in_options.is_empty() || args.plan_in_layout.is_some();
-        let plan_in =
-            if asked { Some(env_options(&args.plan_in_options, args.plan_in_layout.as_deref())?) } else { None };
+        let plan_in = match &args.plan_in {
+            Some(id) => Some(PlanIn::Model(id.clone())),
+            None if asked => Some(PlanIn::Options(env_options(&args.plan_in_options, args.plan_in_layout.as_deref())?)),
+            None => None,
+        };
         Ok(Self { folds: args.folds, plan_in })
     }
 }
@@ -64,8 +76,8 @@ impl Extras {
 pub struct Fitted<'a> {
     /// What was asked.
     pub job: &'a Job,
-    /// Environment.
-    pub spec: &'a EnvSpec,
+    /// Environment; `None` where only the learner knows it.
+    pub spec: Option<&'a EnvSpec>,
     /// Style in force.
     pub style: &'a str,
     /// Model fitted in.
@@ -98,11 +110,12 @@ pub async fn answer(
         None => None,
         Some(folds) => {
             let spinner = narrator.spinner("validate");
+            let features = features_of(fitted.model)?;
             let (mdp, data, options, method) =
                 (fitted.mdp.clone(), trajectories.clone(), options.clone(), fitted.job.method);
             let validated = tokio::task::spawn_blocking(move || {
                 let method = irl::method(method).ok_or_else(|| wrong(&"unknown method"))?;
-                cross_validate(method, (&mdp, None), &options, &data, folds).map_err(|error| {
+                cross_validate(method, (&mdp, features.as_ref()), &options, &data, folds).map_err(|error| {
                     CliError::failure(
                         format!("cannot cross-validate: {error}"),
                         "choose another number of --folds, or none",
@@ -128,16 +141,14 @@ pub async fn answer(
 
 /// Plans on the learned reward in another model, beside policies that are carried over as they are.
 async fn transfer(
-    plan_in: &Options,
+    plan_in: &PlanIn,
     fitted: &Fitted<'_>,
     options: &FitOptions,
     trajectories: &[Trajectory],
     services: &Services,
 ) -> Result<Transfer, CliError> {
     let (job, learned) = (fitted.job, fitted.learned);
-    let mut env_options = job.env_options.clone();
-    env_options.extend(plan_in.clone());
-    let target = scene::model(services.environments(), fitted.spec, &env_options).await?;
+    let (target, told, driven) = target(plan_in, fitted, services).await?;
     let target_mdp = scene::checked(&target)?;
     let truth = scene::truth(job.discount(), fitted.style, &target, &target_mdp)?;
     let matching = Matching::new((fitted.mdp, &fitted.model.state_labels), (&target_mdp, &target.state_labels))
@@ -164,7 +175,14 @@ async fn transfer(
         acting.push(("the optimal policy there".to_owned(), truth.optimal_policy.clone()));
     }
     let n_actions = target_mdp.n_actions();
-    let counts_events = evaluate::counts_events(fitted.spec);
+    let counts_events = driven.is_some() && fitted.spec.is_some_and(evaluate::counts_events);
+    let env_options = driven.unwrap_or_default();
+    if truth.is_none() && !counts_events {
+        return Err(CliError::failure(
+            format!("nothing to judge by in {told}: no reward of style '{}' is known there", fitted.style),
+            "import a model with that style's reward, or plan in the environment with --plan-in-option",
+        ));
+    }
     let drive = async |controller: Controller, burn_in_steps: u32| {
         let rollout = Rollout {
             options: env_options.clone(),
@@ -194,7 +212,7 @@ async fn transfer(
         let metrics = if counts_events { drive(Controller::Policy(policy), 0).await? } else { None };
         rows.push(TransferRow { name, agreement, expected_value_difference: lost, metrics });
     }
-    if counts_events && fitted.spec.drivers.iter().any(|(name, _)| name == fitted.style) {
+    if counts_events && fitted.spec.is_some_and(|spec| spec.drivers.iter().any(|(name, _)| name == fitted.style)) {
         let expert = Expert::driver(fitted.style);
         let metrics = drive(expert.controller, 0).await?;
         rows.push(TransferRow {
@@ -204,15 +222,56 @@ async fn transfer(
             metrics,
         });
     }
-    let told = plan_in.iter().map(|(name, value)| match value {
-        serde_json::Value::String(text) if text.contains('\n') => format!("{name} of {} rows", text.lines().count()),
-        other => format!("{name}={other}"),
-    });
-    Ok(Transfer {
-        target: format!("{} with {}", job.env_id, told.collect::<Vec<_>>().join(", ")),
-        new_states: matching.unmatched() as u64,
-        rows,
-    })
+    Ok(Transfer { target: told, new_states: matching.unmatched() as u64, rows })
+}
+
+/// The other model, what it is called, and the options to drive there where a server simulates it.
+async fn target(
+    plan_in: &PlanIn,
+    fitted: &Fitted<'_>,
+    services: &Services,
+) -> Result<(Model, String, Option<Options>), CliError> {
+    let job = fitted.job;
+    match (plan_in, fitted.spec) {
+        (PlanIn::Options(plan_in), Some(spec)) => {
+            let mut options = job.env_options.clone();
+            options.extend(plan_in.clone());
+            let model = scene::model(services.environments()?, spec, &options).await?;
+            let told = plan_in.iter().map(|(name, value)| match value {
+                serde_json::Value::String(text) if text.contains('\n') => {
+                    format!("{name} of {} rows", text.lines().count())
+                }
+                other => format!("{name}={other}"),
+            });
+            let told = format!("{} with {}", job.env_id, told.collect::<Vec<_>>().join(", "));
+            Ok((model, told, Some(options)))
+        }
+        (PlanIn::Options(_), None) => Err(CliError::usage(
+            format!("no server simulates {}, so that it has no options to plan under", job.env_id),
+            "name another stored model with --plan-in MODEL; see 'learner list --models'",
+        )),
+        (PlanIn::Model(asked), _) => {
+            // Of any environment: its states decide whether it fits.
+            let chosen = models::choose(services.learner(), "", Some(asked)).await?;
+            let (id, _) = chosen.ok_or_else(|| {
+                CliError::failure(format!("there is no model '{asked}'"), "see the models with 'learner list --models'")
+            })?;
+            let model = services.learner().model(&id).await?;
+            let told = format!("model {} of {}", id.chars().take(12).collect::<String>(), model.env_id);
+            Ok((model, told, None))
+        }
+    }
+}
+
+/// The users' features of a model, as the mathematics takes them.
+fn features_of(model: &Model) -> Result<Option<Features>, CliError> {
+    let Some(table) = &model.features else { return Ok(None) };
+    let (n_states, n_actions) = (model.n_states as usize, model.n_actions as usize);
+    let features = match table.domain {
+        FeatureDomain::States => Features::of_states(n_states, n_actions, table.names.clone(), &table.values),
+        FeatureDomain::StateActions => Features::of_pairs(n_states * n_actions, table.names.clone(), &table.values),
+    };
+    features.map(Some).map_err(|error| wrong(&error))
 }
 
 /// The planner under which the learned reward gives the learned policy: a method may have planned softly, whatever planner was
@@ -240,6 +299,8 @@ fn clone_of(mdp: &TabularMdp, options: &FitOptions, trajectories: &[Trajectory])
     builder.extend(trajectories).map_err(|error| wrong(&error))?;
     let statistics = builder.finish().map_err(|error| wrong(&error))?;
     let demonstrations = Demonstrations::new(trajectories.to_vec());
+    // A clone has no reward, hence no basis.
+    let options = &FitOptions { basis: irl::BasisKind::State, ..options.clone() };
     let problem =
         Problem { mdp, options, statistics: &statistics, demonstrations: Some(&demonstrations), features: None };
     let fit = irl::fit(method, &problem, &mut |_| ControlFlow::Continue(()))

@@ -76,10 +76,10 @@ async fn fit(
     let begun = Instant::now();
     let spec = match (&job.model, services.spec(&job.env_id).await) {
         (None, Ok(spec)) => spec,
-        (Some(_), _) => return imported::fit(args, job, services, narrator, begun).await,
+        (Some(_), _) => return imported::fit(args, job, extras, services, narrator, begun).await,
         (None, Err(error)) => {
             if services.imported(&job.env_id).await? {
-                return imported::fit(args, job, services, narrator, begun).await;
+                return imported::fit(args, job, extras, services, narrator, begun).await;
             }
             return Err(error);
         }
@@ -113,7 +113,7 @@ async fn fit(
         narrator.step("judged", format_args!("{episodes} episodes of up to {steps} steps a driver"))?;
     }
     let fitted =
-        Fitted { job, spec: &spec, style: &style, model: &model, mdp: &mdp, fit: &fit, learned: &learned };
+        Fitted { job, spec: Some(&spec), style: &style, model: &model, mdp: &mdp, fit: &fit, learned: &learned };
     let answers = judge::answer(extras, &fitted, services, narrator).await?;
     let frame = evaluate::frame(job, &learned.greedy_policy, policies.n_actions, services).await?;
     let sources = services.sources(&recordings).await?;

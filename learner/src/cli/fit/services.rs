@@ -87,7 +87,7 @@ impl Services {
         Ok(())
     }
 
-    fn environments(&self) -> Result<&Connection, CliError> {
+    pub fn environments(&self) -> Result<&Connection, CliError> {
         self.environments.as_ref().map_err(Clone::clone)
     }
 
@@ -152,11 +152,6 @@ impl Services {
     /// The server refuses.
     pub async fn env(&self, env_id: &str, options: SessionOptions) -> Result<Env, CliError> {
         Ok(Env::create(self.environments()?, env_id, options).await?)
-    }
-
-    /// The environment server.
-    pub fn environments(&self) -> &Connection {
-        &self.environments
     }
 
     /// Trajectories by id, in the order of the ids, all of which the filter selects.

@@ -9,6 +9,7 @@ use crate::report::format::{brief, count};
 use crate::report::uncertainty::UncertaintySource;
 use crate::report::{Report, ReportError};
 use plotters::style::Color;
+use std::fmt::Write as _;
 
 /// Weights drawn at most.
 const MOST: usize = 48;
@@ -49,7 +50,7 @@ fn weights(report: &Report) -> Result<Option<Picture>, ReportError> {
         UncertaintySource::Posterior => "posterior mean and 95 % interval".to_owned(),
     };
     if shown.len() < report.weights.len() {
-        note += &format!("; {} of {} weights", shown.len(), count(report.weights.len() as f64));
+        let _ = write!(note, "; {} of {} weights", shown.len(), count(report.weights.len() as f64));
     }
     let svg = Canvas::draw("weights", (WIDTH, TITLE + height + 40.0), &format!("Weights: {note}"), |canvas| {
         title(canvas, MARGIN, 0.0, WIDTH - 2.0 * MARGIN, "Weights and what is open", &note);

@@ -145,7 +145,7 @@ mod tests {
             let want = [0.0, 1.0, 1.0, 0.0, 1.0, 0.0, 1.0, 0.0, 1.0, 0.0, 0.5, 0.5];
             assert_eq!(found.greedy_policy, want, "{discount}");
             assert!(found.warnings.iter().any(|w| w.contains("from 1 of 6 states")), "{:?}", found.warnings);
-            let smooth = FitOptions { smoothing: 1.0, ..options };
+            let smooth = FitOptions { smoothing: 1.0, ..options.clone() };
             let problem = Problem { options: &smooth, ..problem };
             let found = irl::fit(&BcPlanning, &problem, &mut |_| ControlFlow::Continue(())).expect("a fit");
             assert_eq!(found.policy[2..6], [0.75, 0.25, 2.0 / 3.0, 1.0 / 3.0]);

@@ -52,7 +52,12 @@ def load():
     transition = np.zeros((n_states, N_ACTIONS, n_states))
     for state, action, following, p in model["transition"]:
         transition[int(state), int(action), int(following)] = p
-    return transition, np.array(demonstrations["states"]), np.array(demonstrations["actions"]), model["optimal_actions"]
+    return (
+        transition,
+        np.array(demonstrations["states"]),
+        np.array(demonstrations["actions"]),
+        model["optimal_actions"],
+    )
 
 
 def agreement(action_values, optimal):
@@ -111,7 +116,14 @@ def run_numpy(transition, states, actions, optimal):
         return weights.sum() - value, 1.0 - gradient
 
     bounds = [(0, None)] * len(transition)
-    minimize(objective, np.zeros(len(transition)), jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 500})
+    minimize(
+        objective,
+        np.zeros(len(transition)),
+        jac=True,
+        method="L-BFGS-B",
+        bounds=bounds,
+        options={"maxiter": 500},
+    )
     return time.process_time() - begun, agreement(likelihood.q, optimal)
 
 
@@ -151,7 +163,8 @@ def run_econirl(transition, states, actions, optimal):
 
     n = len(transition)
     trajectories = [
-        Trajectory(jnp.array(s[:-1]), jnp.array(a[:-1]), jnp.array(s[1:])) for s, a in zip(states, actions, strict=True)
+        Trajectory(jnp.array(s[:-1]), jnp.array(a[:-1]), jnp.array(s[1:]))
+        for s, a in zip(states, actions, strict=True)
     ]
     features = jnp.array(np.repeat(np.eye(n)[:, None, :], N_ACTIONS, axis=1))
     problem = DDCProblem(num_states=n, num_actions=N_ACTIONS, discount_factor=DISCOUNT)
@@ -230,12 +243,16 @@ def environment(directory, packages):
 
 def peer(python, name):
     command = [python, __file__, "--run", name]
-    output = subprocess.run(command, env=os.environ | ONE_THREAD, check=True, capture_output=True, text=True).stdout
+    output = subprocess.run(
+        command, env=os.environ | ONE_THREAD, check=True, capture_output=True, text=True
+    ).stdout
     return json.loads(output.splitlines()[-1])
 
 
 def ours(binary, rounds):
-    return json.loads(subprocess.run([binary, str(rounds)], check=True, capture_output=True, text=True).stdout)
+    return json.loads(
+        subprocess.run([binary, str(rounds)], check=True, capture_output=True, text=True).stdout
+    )
 
 
 def build():
@@ -247,8 +264,12 @@ def build():
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--rounds", type=int, default=5, help="rounds, of which medians are shown [default: 5]")
-    parser.add_argument("--peers", default="numpy,econirl", help="of numpy, econirl, imitation [default: numpy,econirl]")
+    parser.add_argument(
+        "--rounds", type=int, default=5, help="rounds, of which medians are shown [default: 5]"
+    )
+    parser.add_argument(
+        "--peers", default="numpy,econirl", help="of numpy, econirl, imitation [default: numpy,econirl]"
+    )
     parser.add_argument("--venv", type=Path, default=Path.home() / ".cache" / "mazeway" / "bench-irl")
     parser.add_argument("--binary", help="the built example fit_times [default: built in release mode]")
     parser.add_argument("--json", action="store_true", help="print one object")
@@ -303,7 +324,9 @@ def main():
     for n, secs in gradients.items():
         print(f"mazeway gradient at {int(n):>7,} states     {1e3 * secs:10.3f} ms")
     print()
-    print(f"{'task':<26} {'peer':<10} {'peer, ms':>12} {'agreement':>10} {'mazeway, ms':>12} {'agreement':>10} {'ratio':>8}")
+    print(
+        f"{'task':<26} {'peer':<10} {'peer, ms':>12} {'agreement':>10} {'mazeway, ms':>12} {'agreement':>10} {'ratio':>8}"
+    )
     for row in rows:
         shares = ["" if row[k] is None else f"{row[k]:.3f}" for k in ("peer_agreement", "mazeway_agreement")]
         print(

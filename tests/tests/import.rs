@@ -503,3 +503,40 @@ fn text_without_transitions() -> String {
     value.as_object_mut().expect("an object").remove("transitions");
     value.to_string()
 }
+
+#[test]
+fn states_alone_are_demonstrations_too() {
+    let data = with_model();
+    write(&data, "seen.csv", "trajectory,state\nx,home\nx,street\nx,park\nx,office\ny,home\ny,street\ny,park\n");
+    let summary = object(&data, &["import", "--env", "Commute", "seen.csv"]);
+    assert_eq!((&summary["stored"], &summary["steps"]), (&2.into(), &5.into()));
+    write(&data, "never.csv", "trajectory,state\nz,home\nz,park\n");
+    let error = refused(&data, &["import", "--env", "Commute", "never.csv"], 1);
+    assert!(error.ends_with("such as never.csv:2 from state 'home' to 'park'"), "{error}");
+    // Back and forth, and fitted: the actions are inferred.
+    said(&data, &["export", "--format", "parquet", "--out", "seen.parquet"]);
+    let again = object(&data, &["import", "seen.parquet"]);
+    assert_eq!((&again["stored"], &again["already_stored"]), (&0.into(), &2.into()));
+    object(&data, &["fit", "--env", "Commute", "--method", "em", "--features", "all"]);
+}
+
+#[test]
+fn a_model_of_many_blocks_comes_back_whole() {
+    let data = directory();
+    let n = 6_000;
+    let row = |state: usize, action: usize| {
+        let next = (state + action + 1) % n;
+        format!("{state},{action},{next},0.75\n{state},{action},{state},0.25\n")
+    };
+    let rows = (0..n).flat_map(|state| [row(state, 0), row(state, 1)]).collect::<String>();
+    let table = format!("state,action,next_state,probability\n{rows}");
+    write(&data, "ring.csv", table);
+    let stored = object(&data, &["import", "--env", "Ring", "--model", "ring.csv"]);
+    assert_eq!(stored["model"]["pairs"], 2 * n);
+    // The model that is checked against is the stored one.
+    write(&data, "walk.csv", format!("trajectory,state,action\nx,{},1\nx,0,0\nx,1,\n", n - 2));
+    assert_eq!(object(&data, &["import", "--env", "Ring", "walk.csv"])["stored"], 1);
+    write(&data, "walk.csv", format!("trajectory,state,action\nx,{},1\nx,1,0\nx,2,\n", n - 2));
+    let error = refused(&data, &["import", "--env", "Ring", "walk.csv"], 1);
+    assert!(error.ends_with(&format!("walk.csv:2 from state '{}' by action '1' to '1'", n - 2)), "{error}");
+}

@@ -1,7 +1,8 @@
 //! JSON lines: an object a trajectory with arrays, as `learner export` writes them, or an object a step.
 
 use super::{
-    demonstrations::{Demonstration, ReadOptions, Resolvers, Role, Seen, finish},
+    columns::{ReadOptions, Role},
+    demonstrations::{Demonstration, Resolvers, Seen, finish},
     error::{FileError, Place},
     names::Resolve,
     table::Table,
@@ -90,7 +91,7 @@ impl<'de> DeserializeSeed<'de> for Cell {
     }
 }
 
-impl<'de> Visitor<'de> for Cell {
+impl Visitor<'_> for Cell {
     type Value = Value;
 
     fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {

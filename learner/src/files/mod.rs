@@ -4,6 +4,7 @@
 //! [`FileError`] that names the place; demonstrations are read one at a time, in memory that grows with the longest of
 //! them and not with the file. Deliberately absent: the store and the wire.
 
+mod columns;
 mod csv;
 mod demonstrations;
 mod error;
@@ -11,12 +12,14 @@ mod export;
 mod json_lines;
 mod model;
 mod model_json;
+mod model_tables;
 mod names;
 mod parquet;
 mod table;
 mod value;
 
-pub use demonstrations::{Demonstration, Format, ReadOptions, read};
+pub use columns::{Format, ReadOptions};
+pub use demonstrations::{Demonstration, read};
 pub use error::{FileError, Place};
 pub use export::{COLUMNS, Naming, ParquetExport, Step};
 pub use model::{ModelFile, Rows, read_model};

@@ -132,8 +132,8 @@ impl<'de> Visitor<'de> for List {
     }
 
     fn visit_u64<E: serde::de::Error>(self, size: u64) -> Result<Names, E> {
-        match u32::try_from(size) {
-            Ok(size) if size > 0 && size <= i32::MAX as u32 => Ok(Names::numbered(self.0, size)),
+        match i32::try_from(size) {
+            Ok(1..) => Ok(Names::numbered(self.0, size as u32)),
             _ => Err(E::custom(format!("expected 1 to {} {}s, got {size}", i32::MAX, self.0))),
         }
     }
@@ -236,7 +236,9 @@ impl<'de> Visitor<'de> for Whole<'_> {
                         return Err(A::Error::custom(format!("expected start probabilities that sum to 1, got {sum}")));
                     }
                     if (sum - 1.0).abs() > 1e-9 {
-                        initial.iter_mut().for_each(|p| *p /= sum);
+                        for p in &mut initial {
+                            *p /= sum;
+                        }
                     }
                     draft.initial = Some(initial);
                 }

@@ -116,18 +116,17 @@ pub fn unseen(model: &Model) -> Vec<(u32, u32)> {
 pub fn describe(model: &Model) -> String {
     let visits: u64 = model.visit_counts.iter().flatten().sum();
     let origin = if model.estimated { format!("estimated from {visits} steps") } else { "exact".to_owned() };
-    let mut text = format!(
-        "{}: {} states, {} actions, {} transitions, {origin}",
+    let names = model.features.as_ref().map(|table| table.names.join(", "));
+    let features = names.map_or_else(String::new, |names| format!(", features {names}"));
+    let terminal = match model.terminal_states.len() {
+        0 => String::new(),
+        n => format!(", {n} terminal"),
+    };
+    format!(
+        "{}: {} states, {} actions, {} transitions, {origin}{features}{terminal}",
         model.env_id,
         model.n_states,
         model.n_actions,
         model.next_states.len(),
-    );
-    if let Some(table) = &model.features {
-        text.push_str(&format!(", features {}", table.names.join(", ")));
-    }
-    if !model.terminal_states.is_empty() {
-        text.push_str(&format!(", {} terminal", model.terminal_states.len()));
-    }
-    text
+    )
 }

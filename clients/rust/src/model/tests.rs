@@ -17,6 +17,12 @@ fn model() -> Model {
         estimated: true,
         rewards: vec![("greedy".into(), vec![0.0, 1.0, -1.0, 0.5])],
         grid: Some(Grid { rows: 1, columns: 3, cells: vec![0, 2] }),
+        features: Some(FeatureTable {
+            names: vec!["x".into(), "y".into()],
+            domain: FeatureDomain::States,
+            values: vec![0.5, -1.0, 0.0, 2.0],
+        }),
+        terminal_states: Vec::new(),
     };
     model.model_id = model.compute_id();
     model

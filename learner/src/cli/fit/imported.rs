@@ -195,10 +195,10 @@ async fn estimate(job: &Job, prior: f64, learner: &Learner) -> Result<Model, Cli
             "import demonstrations with 'learner import FILE'",
         ));
     };
-    let stored = match models::choose(learner, &job.env_id, None).await? {
-        Some((id, _)) => Some(learner.model(&id).await?).filter(|m| (m.n_states, m.n_actions) == (n_states, n_actions)),
-        None => None,
-    };
+    let mut stored = None;
+    if let Some((id, _)) = models::choose(learner, &job.env_id, None).await? {
+        stored = Some(learner.model(&id).await?).filter(|m| (m.n_states, m.n_actions) == (n_states, n_actions));
+    }
     let (names, description) = match stored {
         Some(model) => (
             models::names(&model),

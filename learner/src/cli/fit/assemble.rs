@@ -176,11 +176,7 @@ pub fn report(parts: Parts<'_>) -> Result<Report, CliError> {
         state_visits: learned.state_visits,
         states_covered: fit.states_covered,
         weights: learned.weights,
-        weight_names: model
-            .features
-            .as_ref()
-            .filter(|table| table.names.len() == n_weights)
-            .map_or_else(Vec::new, |table| table.names.clone()),
+        weight_names: if fit.feature_names.len() == n_weights { fit.feature_names.clone() } else { Vec::new() },
         uncertainty: learned.uncertainty,
         hyperparameters: fit
             .hyperparameters

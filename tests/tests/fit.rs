@@ -59,6 +59,8 @@ fn three_styles_are_learned_and_drive_differently() {
             "fit_secs",
             "total_secs",
             "report",
+            "uncertainty",
+            "hyperparameters",
         ];
         expected.sort_unstable();
         assert_eq!(names, expected);

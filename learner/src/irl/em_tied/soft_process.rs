@@ -215,8 +215,10 @@ impl<'a> SoftProcess<'a> {
         let Proposal { policy, changed, rows, .. } = &mut self.proposal;
         for (row, &state) in rows.iter_mut().zip(changed.iter()) {
             row.clear();
-            for pair in state * n_actions..(state + 1) * n_actions {
-                let moved = self.discount * (policy[pair] - self.inverted[pair]);
+            let pairs = state * n_actions..(state + 1) * n_actions;
+            let moves = policy[pairs.clone()].iter().zip(&self.inverted[pairs.clone()]);
+            for (pair, (new, old)) in pairs.zip(moves) {
+                let moved = self.discount * (new - old);
                 let (next, probabilities) = self.mdp.row(pair);
                 row.extend(next.iter().zip(probabilities).map(|(&s, &p)| (s as usize, -moved * p)));
             }

@@ -106,13 +106,13 @@ fn a_killed_comparison_goes_on_where_it_was() {
         ["--methods", "em-tied:posterior=none,em,bc", "--trajectories", "1,2,3,4,5,6,7,8,9,10,20,50", "--seeds", "20"];
     let out = tempfile::tempdir().expect("a directory");
     let journal = out.path().join("journal.jsonl");
-    let lines = || std::fs::read(&journal).map_or(0, |text| text.iter().filter(|&&byte| byte == b'\n').count());
+    let lines = || std::fs::read(&journal).map_or(0, |text| text.split(|&byte| byte == b'\n').count() - 1);
     let mut child = compare(out.path(), &[&grid[..], &["--threads", "1"]].concat())
         .stdout(Stdio::null())
         .stderr(Stdio::null())
         .spawn()
         .expect("a process");
-    let deadline = Instant::now() + Duration::from_secs(120);
+    let deadline = Instant::now() + Duration::from_mins(2);
     while lines() < 40 {
         assert!(Instant::now() < deadline, "no progress");
         std::thread::sleep(Duration::from_millis(2));
@@ -133,7 +133,7 @@ fn a_killed_comparison_goes_on_where_it_was() {
     assert!(text.contains(&format!("found       {finished} of 720 fits")), "{text}");
     assert!(text.contains(&format!("fitted      {} fits", 720 - finished)), "{text}");
     let whole = std::fs::read(&journal).expect("a journal");
-    let whole_lines = whole[..kept.len()].iter().filter(|&&byte| byte == b'\n').count();
+    let whole_lines = whole[..kept.len()].split(|&byte| byte == b'\n').count() - 1;
     assert!(whole_lines == finished && whole.starts_with(&kept[..kept.iter().rposition(|&b| b == b'\n').unwrap_or(0)]));
     assert_eq!(lines(), 720);
 

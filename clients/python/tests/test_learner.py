@@ -243,7 +243,7 @@ def test_wrong_fits(learner, style):
     assert isinstance(caught.value, (mazeway.WrongStateError, mazeway.NotFoundError))
     for options, message in (
         ({"gamma": 0.9}, "gamma: unknown option, expected one of discount"),
-        ({"basis": "wavelet"}, "basis: expected one of 'state', 'state-action', got 'wavelet'"),
+        ({"basis": "wavelet"}, "basis: expected one of 'state', 'state-action', 'features', got 'wavelet'"),
         ({"discount": "high"}, "discount"),
         ({"horizon": -3}, "horizon"),
     ):

@@ -298,11 +298,11 @@ pub(super) fn insert(connection: &Connection, path: &Path, model: &Model, replac
             return Ok(Put::Known);
         }
         if !replace {
-            return Err(StoreError::ModelExists {
-                id: header.model_id.clone(),
-                env_id: known.env_id.clone(),
-                differs: differing(&known, header),
-            });
+            let differs = differing(&known, header);
+            if differs.is_empty() {
+                return Ok(Put::Known);
+            }
+            return Err(StoreError::ModelExists { id: header.model_id.clone(), env_id: known.env_id.clone(), differs });
         }
         let values = params![header.env_id, document, rows.visit_counts.as_ref(), header.model_id];
         connection
@@ -329,17 +329,21 @@ pub(super) fn insert(connection: &Connection, path: &Path, model: &Model, replac
     Ok(Put::Stored)
 }
 
-/// In what two headers of the same rows differ.
+/// In what a new header contradicts the known one of the same rows; what it leaves out contradicts nothing.
 fn differing(known: &ModelHeader, new: &ModelHeader) -> String {
+    let labels = |known: &[String], new: &[String]| !new.is_empty() && known != new;
     let parts = [
         ("environment", known.env_id != new.env_id),
-        ("labels", known.state_labels != new.state_labels || known.action_labels != new.action_labels),
-        ("start distribution", known.initial_distribution != new.initial_distribution),
-        ("rewards", known.rewards != new.rewards),
-        ("features", known.features != new.features),
-        ("terminal states", known.terminal_states != new.terminal_states),
+        ("labels", labels(&known.state_labels, &new.state_labels) || labels(&known.action_labels, &new.action_labels)),
+        (
+            "start distribution",
+            !new.initial_distribution.is_empty() && known.initial_distribution != new.initial_distribution,
+        ),
+        ("rewards", !new.rewards.is_empty() && known.rewards != new.rewards),
+        ("features", new.features.is_some() && known.features != new.features),
+        ("terminal states", !new.terminal_states.is_empty() && known.terminal_states != new.terminal_states),
         ("origin", known.estimated != new.estimated),
-        ("grid", known.grid != new.grid),
+        ("grid", new.grid.is_some() && known.grid != new.grid),
     ];
     parts.into_iter().filter(|part| part.1).map(|part| part.0).collect::<Vec<_>>().join(", ")
 }

@@ -120,10 +120,13 @@ pub struct Comparison {
     pub pairs: Vec<Pair>,
 }
 
+/// Differences below this are rounding, however sure they are.
+const ROUNDING: f64 = 1e-9;
+
 impl Difference {
     fn new(differences: &[f64], higher_is_better: bool) -> Option<Self> {
         let Interval { mean, low, high } = mean_interval(differences)?;
-        let verdict = match (low > 0.0, high < 0.0) {
+        let verdict = match (low > ROUNDING, high < -ROUNDING) {
             (true, _) if higher_is_better => Verdict::Better,
             (_, true) if !higher_is_better => Verdict::Better,
             (false, false) => Verdict::Open,

@@ -30,6 +30,7 @@ use std::{
 const SCHEMA: u32 = 1;
 
 /// Demonstrations of one seed.
+#[expect(clippy::struct_field_names, reason = "the seed of a seed's demonstrations")]
 pub struct Seed {
     /// Of the first demonstration.
     pub seed: u32,
@@ -210,22 +211,19 @@ impl Grid {
         let n_actions = self.mdp.n_actions();
         let greedy = Policy::new(n_actions, fit.greedy_policy.clone()).map_err(|error| error.to_string())?;
         let held_out = eval::held_out(&fit.policy, n_actions, &seed.held_out).ok_or("nothing to judge by")?;
-        let (agreement, evd) = match &self.truth {
-            Some((reward, optimal)) => {
-                let discount = self.entries[0].options.discount;
-                let lost = eval::expected_value_difference(&self.mdp, reward, discount, Some(self.horizon), &greedy)
-                    .map_err(|error| error.to_string())?;
-                (eval::state_agreement(&fit.greedy_policy, optimal.probabilities(), n_actions), Some(lost.difference))
-            }
-            None => {
-                let mut counts = vec![0.0; self.mdp.n_pairs()];
-                for trajectory in &seed.held_out {
-                    for (&state, &action) in trajectory.states().iter().zip(trajectory.actions()) {
-                        counts[self.mdp.pair(state as usize, action as usize)] += 1.0;
-                    }
+        let (agreement, evd) = if let Some((reward, optimal)) = &self.truth {
+            let discount = self.entries[0].options.discount;
+            let lost = eval::expected_value_difference(&self.mdp, reward, discount, Some(self.horizon), &greedy)
+                .map_err(|error| error.to_string())?;
+            (eval::state_agreement(&fit.greedy_policy, optimal.probabilities(), n_actions), Some(lost.difference))
+        } else {
+            let mut counts = vec![0.0; self.mdp.n_pairs()];
+            for trajectory in &seed.held_out {
+                for (&state, &action) in trajectory.states().iter().zip(trajectory.actions()) {
+                    counts[self.mdp.pair(state as usize, action as usize)] += 1.0;
                 }
-                (eval::step_agreement(&fit.greedy_policy, &counts), None)
             }
+            (eval::step_agreement(&fit.greedy_policy, &counts), None)
         };
         let score = Score { agreement, evd, log_likelihood: held_out.log_likelihood.mean, fit_secs };
         let finite = score.agreement.is_finite() && score.log_likelihood.is_finite() && evd.is_none_or(f64::is_finite);

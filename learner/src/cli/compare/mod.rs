@@ -40,13 +40,11 @@ pub async fn run(args: CompareArgs) -> Result<(), CliError> {
     let environments = Environments::start(args.env_addr.as_deref()).await?;
     let outcome = async {
         let compared = compare(&job, &environments.connection, narrator, |style| {
-            Ok(match &args.out {
-                Some(out) => out.clone(),
-                None => {
-                    let name = super::fit::directory_name(&["compare", &job.env_id, style]);
-                    data_directory(args.data.clone())?.join("reports").join(name)
-                }
-            })
+            if let Some(out) = &args.out {
+                return Ok(out.clone());
+            }
+            let name = super::fit::directory_name(&["compare", &job.env_id, style]);
+            Ok(data_directory(args.data.clone())?.join("reports").join(name))
         });
         let (comparison, out) = compared.await?;
         let written = output::write(&job, &comparison, &out)?;

@@ -199,20 +199,13 @@ async fn estimate(job: &Job, prior: f64, learner: &Learner) -> Result<Model, Cli
     if let Some((id, _)) = models::choose(learner, &job.env_id, None).await? {
         stored = Some(learner.model(&id).await?).filter(|m| (m.n_states, m.n_actions) == (n_states, n_actions));
     }
-    let (names, description) = match stored {
-        Some(model) => (
-            models::names(&model),
-            models::Description {
-                features: model.features,
-                terminal_states: model.terminal_states,
-                rewards: model.rewards,
-                initial_distribution: None,
-            },
-        ),
-        None => {
-            let names = (Names::numbered("state", n_states), Names::numbered("action", n_actions));
-            (names, models::Description::default())
-        }
+    let (names, description) = if let Some(model) = stored {
+        let names = models::names(&model);
+        let (features, terminal_states, rewards) = (model.features, model.terminal_states, model.rewards);
+        (names, models::Description { features, terminal_states, rewards, initial_distribution: None })
+    } else {
+        let names = (Names::numbered("state", n_states), Names::numbered("action", n_actions));
+        (names, models::Description::default())
     };
     let model = models::estimate(&job.env_id, &counts, (&names.0, &names.1), description, prior)?;
     match learner.put_model(&model).await {

@@ -23,7 +23,10 @@ pub fn maze(rows: &[[String; 5]]) -> String {
     table(["method", "#agreement", "#EVD", "#iterations", "#time of the fit"], rows.to_vec()) + "\n"
 }
 
-const EVENTS: [(&str, fn(&DriverMetrics) -> Interval); 4] = [
+/// A column: its title, and what it shows of a driver.
+type Event = (&'static str, fn(&DriverMetrics) -> Interval);
+
+const EVENTS: [Event; 4] = [
     ("speed, m/s", |m| m.speed_mps),
     ("collisions a step", |m| m.collisions),
     ("overtakes left", |m| m.overtakes_left),

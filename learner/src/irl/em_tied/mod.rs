@@ -6,7 +6,7 @@
 //! discrete choice (Rust 1987), and standard errors come from the exact Hessian.
 //!
 //! The optimum is a point; with few demonstrations many rewards explain them. Under the penalty L1 the default goes on to the
-//! posterior under a sparse prior ([`spike_slab`]) and acts on its mean, which minimises the expected loss of value over all
+//! posterior under a sparse prior (`spike_slab`) and acts on its mean, which minimises the expected loss of value over all
 //! rewards that may be true (Ramachandran & Amir 2007, theorem 3). Without a posterior the greedy policy takes the best
 //! actions under the soft Q itself, not those of a hard planner on the learned reward.
 

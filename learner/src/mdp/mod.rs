@@ -28,5 +28,5 @@ pub use planners::soft::SoftSolver;
 pub use policy::{Policy, PolicyError, TIE_TOLERANCE};
 pub use tabular::{MdpError, TabularMdp};
 
-pub(crate) use linear::Resolvent;
+pub(crate) use linear::{Factored, Resolvent};
 pub(crate) use numeric::{log_sum_exp, max_abs};

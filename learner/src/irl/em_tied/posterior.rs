@@ -1,7 +1,9 @@
 //! From the optimum to the posterior: which way, how many draws, and what to act on.
 
-use super::soft_process::MAX_STATES;
-use super::spike_slab::{Chain, Neighbours, Places, Prior};
+use super::places::{Neighbours, Places};
+use super::prior::Prior;
+use super::soft_process::SoftProcess;
+use super::spike_slab::Chain;
 use super::{MAX_STANDARD_ERRORS, SoftLikelihood, laplace};
 use crate::irl::random::Stream;
 use crate::irl::{
@@ -13,10 +15,12 @@ use rayon::prelude::*;
 /// Most basis functions that are sampled.
 const MAX_BASIS: usize = 2000;
 /// Draws that a chain forgets and keeps, where the options do not say.
-const WARM_UP: u32 = 50;
+const WARM_UP: u32 = 100;
 const DRAWS: u32 = 100;
 /// Proposals from one draw to the next.
-const PROPOSALS: u32 = 10;
+const PROPOSALS: u32 = 15;
+/// Power of the likelihood at which chains begin.
+const WARMEST: f64 = 0.02;
 /// Most numbers that all chains may keep together (800 MB).
 const MAX_NUMBERS: u64 = 100_000_000;
 /// Chains with a larger split-R̂ do not agree.
@@ -38,11 +42,12 @@ pub(super) fn add(
 ) -> Result<(), FitError> {
     let options = problem.options;
     let gaussian = options.posterior == PosteriorKind::Laplace || options.penalty == Penalty::L2;
-    let sampled =
-        !gaussian && options.discount < 1.0 && problem.mdp.n_states() <= MAX_STATES && basis.len() <= MAX_BASIS;
-    if sampled {
-        let slopes: Vec<f64> = likelihood.value_and_gradient(&fit.weights).1.iter().map(|g| strength - g).collect();
-        return sample(problem, basis, &Places::new(&slopes), fit, trace);
+    if !gaussian && options.discount < 1.0 && basis.len() <= MAX_BASIS {
+        let counts = problem.statistics.counts(options.horizon);
+        if let Some(process) = SoftProcess::new(problem.mdp, options.discount, &counts) {
+            let slopes: Vec<f64> = likelihood.value_and_gradient(&fit.weights).1.iter().map(|g| strength - g).collect();
+            return sample(problem, (basis, &Places::new(&slopes)), &process, fit, trace);
+        }
     }
     if basis.len() > MAX_STANDARD_ERRORS {
         fit.warnings.push(format!(
@@ -65,7 +70,7 @@ pub(super) fn add(
     } else if !gaussian {
         fit.warnings.push(format!(
             "the posterior is a Gaussian around the optimum, whose policy this is: sampling takes a discount below 1, at most \
-             {MAX_STATES} states and {MAX_BASIS} basis functions"
+             {MAX_BASIS} basis functions, and a model whose factors are sparse or small"
         ));
     }
     Ok(())
@@ -74,23 +79,18 @@ pub(super) fn add(
 /// Draws from the posterior under the sparse prior and acts on the mean of the reward.
 fn sample(
     problem: &Problem<'_>,
-    basis: &Basis,
-    places: &Places,
+    (basis, places): (&Basis, &Places),
+    process: &SoftProcess<'_>,
     fit: &mut Fit,
     trace: &mut Trace<'_>,
 ) -> Result<(), FitError> {
     let (mdp, options) = (problem.mdp, problem.options);
-    let counts = problem.statistics.counts(options.horizon);
     let (warm_up, draws) = (options.warm_up.unwrap_or(WARM_UP), options.draws.unwrap_or(DRAWS));
     let n_chains = options.chains;
-    let (n_states, n_basis) = (mdp.n_states() as u64, basis.len() as u64);
-    let numbers = u64::from(draws)
-        .saturating_mul(n_basis)
-        .saturating_add(n_states * n_states)
-        .saturating_mul(u64::from(n_chains));
+    let numbers = u64::from(draws).saturating_mul(basis.len() as u64).saturating_mul(u64::from(n_chains));
     if numbers > MAX_NUMBERS {
         return Err(FitError::TooLarge {
-            what: "numbers for em-tied, chains times (draws times basis functions + states squared)",
+            what: "numbers for em-tied, chains times draws times basis functions",
             limit: MAX_NUMBERS as usize,
             got: numbers as usize,
         });
@@ -107,8 +107,8 @@ fn sample(
             let prior = Prior::begin(options.penalty_strength.filter(|_| fixed));
             let least = largest * (0.05 + 0.55 * stream.uniform());
             let from = start.iter().map(|&w| if w > least { prior.scale } else { 0.0 }).collect();
-            let setting = (mdp, basis, &neighbours, places);
-            let chain = Chain::new(setting, (&counts, options.discount), from, (prior, fixed), stream);
+            let setting = (basis, &neighbours, places);
+            let chain = Chain::new(setting, process.clone(), from, (prior, fixed), stream);
             Sampled::new(chain, mdp.n_pairs())
         })
         .collect();
@@ -116,7 +116,12 @@ fn sample(
     let mut done = 0;
     while done < total {
         let now = done..total.min(done + BLOCK);
-        chains.par_iter_mut().for_each(|chain| now.clone().for_each(|draw| chain.draw(draw >= warm_up)));
+        chains.par_iter_mut().for_each(|chain| {
+            for draw in now.clone() {
+                chain.chain.set_coldness(coldness(draw, warm_up));
+                chain.draw(draw >= warm_up);
+            }
+        });
         done = now.end;
         trace.check()?;
     }
@@ -150,6 +155,12 @@ fn sample(
     fit.weights = mean;
     fit.posterior = Some(posterior);
     Ok(())
+}
+
+/// Power of the likelihood at a draw: chains are annealed over the first half of their warm-up.
+fn coldness(draw: u32, warm_up: u32) -> f64 {
+    let left = 1.0 - 2.0 * f64::from(draw) / f64::from(warm_up.max(1));
+    WARMEST.powf(left.max(0.0))
 }
 
 /// A chain and what is kept of it.

@@ -5,63 +5,23 @@
 //! a slab, Mitchell & Beauchamp 1988, with a second spike at the full reward: R lies in [0, 1], Hahn & Zoubir §3, up to the
 //! temperature 1/μ). How sparse, how sharp and how alike the rewards are is learned from the data: p and ρ have Beta priors,
 //! μ and the shape of the Gamma log-normal ones. The likelihood is em-tied's own, of the soft-optimal policy.
-//! Metropolis-Hastings moves change one reward, let one appear or vanish, carry one to another place, or scale all.
+//! Metropolis-Hastings moves change one reward, let one appear or vanish, carry one to another place, or scale all. Where a
+//! move seldom fits the data, the tangent of the likelihood turns it down before anything is solved.
 //!
 //! Invariant: a chain depends on its seed and index alone.
 
+use super::places::{Neighbours, Places};
+use super::prior::{ALIKE, LOG_SCALE, LOG_SHAPE, Prior, SPARSITY, log_hyper};
 use super::soft_process::SoftProcess;
+use crate::irl::Basis;
 use crate::irl::random::Stream;
-use crate::irl::{Basis, BasisKind};
-use crate::mdp::TabularMdp;
 
-/// Mean and standard deviation of log μ, a reward against the temperature: from about 4 to about 90.
-const LOG_SCALE: (f64, f64) = (3.0, 0.75);
-/// The same of log(shape of the Gamma): 1 is exponential, a large one makes all rewards alike.
-const LOG_SHAPE: (f64, f64) = (0.7, 0.3);
-/// ρ ~ Beta(this, 1): before any data, rewards are alike.
-const ALIKE: f64 = 9.0;
-/// p ~ Beta(1, this × number of weights): before any data, about two rewards are expected.
-const SPARSITY: f64 = 0.5;
-/// Share of places drawn uniformly.
-const EVERYWHERE: f64 = 0.3;
 /// Proposals between two changes of the prior's parameters.
 const PRIOR_PERIOD: u32 = 10;
-
-/// What the prior's parameters are, or are held at.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Prior {
-    /// p: probability that a weight is not 0.
-    pub inclusion: f64,
-    /// ρ: probability that one that is not 0 is the full reward.
-    pub full: f64,
-    /// μ: the full reward, and the mean of the others.
-    pub scale: f64,
-    /// Shape of the Gamma distribution of the others.
-    pub shape: f64,
-}
-
-impl Prior {
-    /// Where a chain begins; with a strength all but p is held: rewards are exponential of that rate.
-    pub(super) fn begin(strength: Option<f64>) -> Self {
-        match strength {
-            None => {
-                Self { inclusion: 0.1, full: ALIKE / (ALIKE + 1.0), scale: LOG_SCALE.0.exp(), shape: LOG_SHAPE.0.exp() }
-            }
-            Some(strength) => Self { inclusion: 0.1, full: 0.0, scale: 1.0 / strength, shape: 1.0 },
-        }
-    }
-
-    /// log density of u where it is neither 0 nor 1.
-    fn log_slab(&self, u: f64) -> f64 {
-        let k = self.shape;
-        (k - 1.0) * u.ln() - k * u + k * k.ln() - ln_gamma(k)
-    }
-}
-
-/// log density of a log-normal parameter against its logarithm, but for a constant.
-fn log_hyper(x: f64, (mean, deviation): (f64, f64)) -> f64 {
-    -0.5 * ((x.ln() - mean) / deviation).powi(2)
-}
+/// Standard deviations of steps of log μ: small ones for what the data determine, large ones to its other modes.
+const SCALE_STEPS: (f64, f64) = (0.1, 1.0);
+/// Most weights that a proposal changes.
+const MAX_CHANGES: usize = 2;
 
 /// One Markov chain.
 pub(super) struct Chain<'a> {
@@ -77,110 +37,52 @@ pub(super) struct Chain<'a> {
     /// Weights that are not 0, in no order of meaning.
     active: Vec<usize>,
     reward: Vec<f64>,
+    /// dℓ/dw, shape (`n_basis`,).
+    slopes: Vec<f64>,
     prior: Prior,
     /// True where all but p is held.
     fixed: bool,
+    /// Power to which the likelihood is raised.
+    coldness: f64,
     proposals: u32,
     accepted: u64,
     tried: u64,
 }
 
-/// Where a reward is tried, and its true place may be: a fixed distribution, so that detailed balance is easy to keep.
-#[derive(Debug)]
-pub(super) struct Places {
-    probability: Vec<f64>,
-    cumulative: Vec<f64>,
-}
-
-impl Places {
-    /// Most often where a little reward would lower the log posterior least: `slopes` are its derivatives at the optimum with
-    /// the sign changed, shape (`n_basis`,), 0 where a weight is free. A reward is tried everywhere now and then.
-    pub(super) fn new(slopes: &[f64]) -> Self {
-        let plausible: Vec<f64> = slopes.iter().map(|g| (1.0 + g.max(0.0)).powi(-2)).collect();
-        let total: f64 = plausible.iter().sum();
-        let n = slopes.len() as f64;
-        let probability: Vec<f64> = plausible.iter().map(|p| EVERYWHERE / n + (1.0 - EVERYWHERE) * p / total).collect();
-        let cumulative = probability
-            .iter()
-            .scan(0.0, |sum, p| {
-                *sum += p;
-                Some(*sum)
-            })
-            .collect();
-        Self { probability, cumulative }
-    }
-
-    fn draw(&self, stream: &mut Stream) -> usize {
-        let u = stream.uniform() * self.cumulative[self.cumulative.len() - 1];
-        self.cumulative.partition_point(|&c| c <= u).min(self.cumulative.len() - 1)
-    }
-}
-
-/// Basis functions near each other, both ways: where a reward may have its true place.
-#[derive(Debug)]
-pub(super) struct Neighbours(Vec<Vec<u32>>);
-
-impl Neighbours {
-    /// One step apart, for the Dirac bases; none for features.
-    pub(super) fn new(mdp: &TabularMdp, kind: BasisKind, n_basis: usize) -> Self {
-        let mut near = vec![Vec::new(); n_basis];
-        if kind != BasisKind::Features {
-            let mut link = |a: usize, b: usize| {
-                if a != b {
-                    near[a].push(b as u32);
-                    near[b].push(a as u32);
-                }
-            };
-            for pair in 0..mdp.n_pairs() {
-                let (state, action) = (pair / mdp.n_actions(), pair % mdp.n_actions());
-                for &next in mdp.row(pair).0 {
-                    match kind {
-                        BasisKind::State => link(state, next as usize),
-                        _ => link(pair, mdp.pair(next as usize, action)),
-                    }
-                }
-                if kind == BasisKind::StateAction {
-                    (0..action).for_each(|other| link(pair, mdp.pair(state, other)));
-                }
-            }
-        }
-        for list in &mut near {
-            list.sort_unstable();
-            list.dedup();
-        }
-        Self(near)
-    }
-}
-
 impl<'a> Chain<'a> {
-    /// Starts at the weights `start`, shape (`n_basis`,), with the prior's parameters at `prior`, all but p held if `fixed`.
+    /// Starts at the weights `start`, shape (`n_basis`,), with the prior's parameters at `prior`, all but p held if `fixed`;
+    /// `process` is one at the reward 0.
     pub(super) fn new(
-        (mdp, basis, neighbours, places): (&'a TabularMdp, &'a Basis, &'a Neighbours, &'a Places),
-        (counts, discount): (&'a [f64], f64),
+        (basis, neighbours, places): (&'a Basis, &'a Neighbours, &'a Places),
+        mut process: SoftProcess<'a>,
         start: Vec<f64>,
         (prior, fixed): (Prior, bool),
         stream: Stream,
     ) -> Self {
-        let reward = basis.reward(&start);
-        let process = SoftProcess::new(mdp, discount, counts, &reward);
-        let active = (0..start.len()).filter(|&b| start[b] > 0.0).collect();
-        let units = start.iter().map(|w| w / prior.scale).collect();
-        let (weights, proposals, accepted, tried) = (start, 0, 0, 0);
+        let mut weights = start;
+        if process.propose(&basis.reward(&weights), f64::NEG_INFINITY).is_some() {
+            process.settle();
+            process.accept();
+        } else {
+            weights.fill(0.0);
+        }
         Self {
             basis,
             neighbours,
             places,
-            process,
             stream,
-            units,
+            units: weights.iter().map(|w| w / prior.scale).collect(),
+            active: (0..weights.len()).filter(|&b| weights[b] > 0.0).collect(),
+            reward: basis.reward(&weights),
+            slopes: basis.project(process.slopes()),
+            process,
             weights,
-            active,
-            reward,
             prior,
             fixed,
-            proposals,
-            accepted,
-            tried,
+            coldness: 1.0,
+            proposals: 0,
+            accepted: 0,
+            tried: 0,
         }
     }
 
@@ -197,6 +99,11 @@ impl<'a> Chain<'a> {
     /// The prior's parameters.
     pub(super) fn prior(&self) -> Prior {
         self.prior
+    }
+
+    /// Raises the likelihood to a power in (0, 1]: less than 1 while the chain warms up and should move freely.
+    pub(super) fn set_coldness(&mut self, coldness: f64) {
+        self.coldness = coldness;
     }
 
     /// Share of proposals that were accepted.
@@ -218,16 +125,17 @@ impl<'a> Chain<'a> {
     /// One Metropolis-Hastings step.
     fn propose(&mut self) {
         let kind = self.stream.uniform();
-        if kind < 0.15 {
+        if kind < 0.1 {
             self.walk();
-        } else if kind < 0.3 {
+        } else if kind < 0.2 {
             self.switch();
         } else if kind < 0.6 {
             self.appear_or_vanish();
-        } else if kind < 0.85 {
-            self.carry(kind < 0.75);
+        } else if kind < 0.9 {
+            self.carry(kind < 0.8);
         } else if !self.fixed {
-            let scale = self.prior.scale * (0.2 * self.stream.normal()).exp();
+            let step = if kind < 0.95 { SCALE_STEPS.0 } else { SCALE_STEPS.1 };
+            let scale = self.prior.scale * (step * self.stream.normal()).exp();
             let ratio = log_hyper(scale, LOG_SCALE) - log_hyper(self.prior.scale, LOG_SCALE);
             self.attempt(&[], scale, ratio);
         }
@@ -263,16 +171,20 @@ impl<'a> Chain<'a> {
         }
     }
 
-    /// A reward appears, drawn from the prior so that its density cancels, or one vanishes.
+    /// A reward appears, its size drawn from the prior so that its density cancels, or one of those that are there vanishes.
     fn appear_or_vanish(&mut self) {
-        let b = self.places.draw(&mut self.stream);
         let odds = self.prior.inclusion.ln() - (-self.prior.inclusion).ln_1p();
-        if self.units[b] > 0.0 {
-            self.attempt(&[(b, 0.0)], self.prior.scale, -odds);
-        } else {
+        let k = self.active.len() as f64;
+        if self.stream.uniform() < 0.5 {
+            let b = self.places.draw(&mut self.stream);
+            if self.units[b] > 0.0 {
+                return;
+            }
             let full = self.stream.uniform() < self.prior.full;
             let new = if full { 1.0 } else { self.gamma(self.prior.shape) / self.prior.shape };
-            self.attempt(&[(b, new)], self.prior.scale, odds);
+            self.attempt_screened(&[(b, new)], odds - ((k + 1.0) * self.places.probability[b]).ln());
+        } else if let Some(b) = self.any_active() {
+            self.attempt_screened(&[(b, 0.0)], (k * self.places.probability[b]).ln() - odds);
         }
     }
 
@@ -290,7 +202,7 @@ impl<'a> Chain<'a> {
         if other != b {
             // where both are rewards the move is its own reverse
             let ratio = if self.units[other] > 0.0 { 0.0 } else { ratio };
-            self.attempt(&[(b, self.units[other]), (other, self.units[b])], self.prior.scale, ratio);
+            self.attempt_screened(&[(b, self.units[other]), (other, self.units[b])], ratio);
         }
     }
 
@@ -298,27 +210,63 @@ impl<'a> Chain<'a> {
     /// likelihood.
     fn attempt(&mut self, changes: &[(usize, f64)], scale: f64, ratio: f64) {
         self.tried += 1;
+        self.decide(changes, scale, ratio, 0.0, |_| 0.0);
+    }
+
+    /// As [`Self::attempt`] at the present scale, in two stages (delayed acceptance, Christen & Fox 2005): the tangent of the
+    /// likelihood turns most proposals down before anything is solved, and the second stage makes up for its error.
+    fn attempt_screened(&mut self, changes: &[(usize, f64)], ratio: f64) {
+        self.tried += 1;
+        let scale = self.prior.scale;
+        let rise = |slopes: &[f64], sign: f64, units: &[f64]| {
+            changes.iter().zip(units).map(|(&(b, new), old)| sign * slopes[b] * scale * (new - old)).sum::<f64>()
+        };
+        let mut before = [0.0; MAX_CHANGES];
+        for (old, &(b, _)) in before.iter_mut().zip(changes) {
+            *old = self.units[b];
+        }
+        let coldness = self.coldness;
+        let first = (ratio + coldness * rise(&self.slopes, 1.0, &before)).min(0.0);
+        if (-self.stream.uniform()).ln_1p() > first {
+            return;
+        }
+        self.decide(changes, scale, ratio, first, |slopes| (coldness * rise(slopes, -1.0, &before) - ratio).min(0.0));
+    }
+
+    /// The stage that solves: `first` is the log of the probability with which the stage before let this proposal pass, and
+    /// `back` gives the same of its reverse from the slopes there.
+    fn decide(&mut self, changes: &[(usize, f64)], scale: f64, ratio: f64, first: f64, back: impl Fn(&[f64]) -> f64) {
         // 1 − u lies in (0, 1]
-        let threshold = self.process.log_likelihood() - ratio + (-self.stream.uniform()).ln_1p();
+        let least = first - ratio + (-self.stream.uniform()).ln_1p();
+        let threshold = self.process.log_likelihood() + least / self.coldness;
         if threshold.is_nan() || !scale.is_finite() || changes.iter().any(|(_, u)| !u.is_finite()) {
             return;
         }
-        let before: Vec<(usize, f64)> = changes.iter().map(|&(b, _)| (b, self.units[b])).collect();
+        let mut before = [(0, 0.0); MAX_CHANGES];
+        for (old, &(b, _)) in before.iter_mut().zip(changes) {
+            *old = (b, self.units[b]);
+        }
         let old = self.prior.scale;
         self.set(changes, scale);
+        // the reverse passes its first stage with a probability of at most 1
         if self.process.propose(&self.reward, threshold).is_some() {
-            self.process.accept();
-            self.accepted += 1;
-            let units = &self.units;
-            self.active.retain(|&b| units[b] > 0.0);
-            for &(b, u) in changes {
-                if u > 0.0 && !self.active.contains(&b) {
-                    self.active.push(b);
+            let (log_likelihood, slopes) = self.process.settle();
+            let slopes = self.basis.project(slopes);
+            if log_likelihood + back(&slopes) / self.coldness >= threshold {
+                self.process.accept();
+                self.slopes = slopes;
+                self.accepted += 1;
+                let units = &self.units;
+                self.active.retain(|&b| units[b] > 0.0);
+                for &(b, u) in changes {
+                    if u > 0.0 && !self.active.contains(&b) {
+                        self.active.push(b);
+                    }
                 }
+                return;
             }
-        } else {
-            self.set(&before, old);
         }
+        self.set(&before[..changes.len()], old);
     }
 
     /// Sets units, the scale and what follows from them, exactly as a fresh start would.
@@ -387,46 +335,12 @@ fn below(stream: &mut Stream, n: usize) -> usize {
     ((stream.uniform() * n as f64) as usize).min(n - 1)
 }
 
-/// log Γ(x) for x > 0: Stirling's series, shifted to where it is exact to 1e-13.
-fn ln_gamma(x: f64) -> f64 {
-    let (mut x, mut shift) = (x, 0.0);
-    while x < 10.0 {
-        shift += x.ln();
-        x += 1.0;
-    }
-    let inverse = 1.0 / (x * x);
-    let series = (1.0 / 12.0 - inverse * (1.0 / 360.0 - inverse * (1.0 / 1260.0 - inverse / 1680.0))) / x;
-    (x - 0.5) * x.ln() - x + 0.5 * (2.0 * std::f64::consts::PI).ln() + series - shift
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn logarithms_of_gamma() {
-        for (x, want) in [
-            (1.0, 0.0),
-            (2.0, 0.0),
-            (0.5, 0.572_364_942_924_700_1),
-            (5.0, 3.178_053_830_347_946),
-            (100.0, 359.134_205_369_575_4),
-        ] {
-            assert!((ln_gamma(x) - want).abs() < 1e-10 * (1.0 + want), "{x}: {}", ln_gamma(x));
-        }
-    }
-
-    #[test]
-    fn a_slab_is_a_density() {
-        let prior = Prior { inclusion: 0.1, full: 0.5, scale: 3.0, shape: 2.5 };
-        let step = 0.001;
-        let points = (0..60_000).map(|i| (f64::from(i) + 0.5) * step);
-        let (mass, mean) = points.fold((0.0, 0.0), |(mass, mean), x| {
-            let p = prior.log_slab(x).exp() * step;
-            (mass + p, mean + x * p)
-        });
-        assert!((mass - 1.0).abs() < 1e-6 && (mean - 1.0).abs() < 1e-5, "{mass} {mean}");
-    }
+    use crate::irl::BasisKind;
+    use crate::irl::em_tied::Likelihood;
+    use crate::mdp::TabularMdp;
 
     /// Without data the chain must give back its prior: the surest test that every move keeps detailed balance.
     #[test]
@@ -441,8 +355,9 @@ mod tests {
         let counts = vec![0.0; 12];
         let chain = |fixed: bool| {
             let prior = Prior::begin(fixed.then_some(0.5));
-            let setting = (&mdp, &basis, &neighbours, &places);
-            Chain::new(setting, (&counts, 0.9), vec![0.0; 6], (prior, fixed), Stream::new(11, u64::from(fixed)))
+            let process = SoftProcess::new(&mdp, 0.9, &counts).expect("a small process");
+            let setting = (&basis, &neighbours, &places);
+            Chain::new(setting, process, vec![0.0; 6], (prior, fixed), Stream::new(11, u64::from(fixed)))
         };
         let mut sampled = chain(true);
         let (mut sizes, mut sums, mut present, mut means) = ([0.0; 7], 0.0, [0.0; 6], 0.0);
@@ -480,13 +395,57 @@ mod tests {
         assert!((full - ALIKE / (ALIKE + 1.0)).abs() < 0.03, "{full}");
     }
 
+    /// With data and all rewards alike, against the sum over all subsets: the two stages of a move keep detailed balance too.
+    #[test]
+    fn with_data_the_chain_samples_the_posterior() {
+        let n = 8_u32;
+        let next: Vec<u32> = (0..n).flat_map(|s| [(s + 1) % n, s, (s + n - 1) % n]).collect();
+        let mdp = TabularMdp::new(8, 3, (0..=24).collect(), next, vec![1.0; 24], None).expect("a model");
+        let basis = Basis::state(&mdp);
+        let neighbours = Neighbours::new(&mdp, BasisKind::State, 8);
+        let places = Places::new(&[0.0, 4.0, 0.5, 9.0, 0.0, 2.0, 1.0, 3.0]);
+        let mut counts = vec![0.0; 24];
+        for (pair, count) in [(0, 2.0), (3, 1.0), (7, 3.0), (11, 2.0), (14, 1.0), (17, 2.0), (20, 1.0), (22, 1.0)] {
+            counts[pair] = count;
+        }
+        let scale = 2.5;
+        let mut likelihood = Likelihood::new(&mdp, &basis, counts.clone(), 0.8);
+        let (mut present, mut total) = ([0.0; 8], 0.0);
+        for subset in 0..256_u32 {
+            let k = subset.count_ones();
+            let weights: Vec<f64> = (0..8).map(|b| scale * f64::from(subset >> b & 1)).collect();
+            // p ~ Beta(1, 4): the number of rewards is beta-binomial
+            let prior = libm::lgamma(1.0 + f64::from(k)) + libm::lgamma(4.0 + f64::from(8 - k));
+            let mass = (prior + likelihood.value_and_gradient(&weights).0).exp();
+            total += mass;
+            (0..8).filter(|b| subset >> b & 1 == 1).for_each(|b| present[b] += mass);
+        }
+        let prior = Prior { full: 1.0, scale, ..Prior::begin(None) };
+        let process = SoftProcess::new(&mdp, 0.8, &counts).expect("a small process");
+        let setting = (&basis, &neighbours, &places);
+        let mut chain = Chain::new(setting, process, vec![0.0; 8], (prior, true), Stream::new(3, 0));
+        let draws = 60_000;
+        let mut found = [0.0; 8];
+        for _ in 0..draws {
+            chain.advance(5);
+            for (f, w) in found.iter_mut().zip(chain.weights()) {
+                *f += f64::from(u8::from(*w > 0.0)) / f64::from(draws);
+            }
+        }
+        let want = present.map(|mass| mass / total);
+        let worst = found.iter().zip(&want).map(|(f, w)| (f - w).abs()).fold(0.0, f64::max);
+        assert!(worst < 0.02, "{found:.3?} for {want:.3?}");
+        assert!(want.iter().any(|w| *w > 0.6) && want.iter().any(|w| *w < 0.2), "{want:.3?}");
+    }
+
     #[test]
     fn gamma_draws_have_their_moments() {
         let mdp = TabularMdp::new(1, 1, vec![0, 1], vec![0], vec![1.0], None).expect("a model");
         let (basis, neighbours, places) =
             (Basis::state(&mdp), Neighbours::new(&mdp, BasisKind::State, 1), Places::new(&[0.0]));
-        let setting = (&mdp, &basis, &neighbours, &places);
-        let mut chain = Chain::new(setting, (&[0.0], 0.5), vec![0.0], (Prior::begin(None), true), Stream::new(1, 1));
+        let process = SoftProcess::new(&mdp, 0.5, &[0.0]).expect("a small process");
+        let setting = (&basis, &neighbours, &places);
+        let mut chain = Chain::new(setting, process, vec![0.0], (Prior::begin(None), true), Stream::new(1, 1));
         for shape in [0.3, 1.0, 7.5] {
             let draws: Vec<f64> = (0..40_000).map(|_| chain.gamma(shape)).collect();
             let mean = draws.iter().sum::<f64>() / 40_000.0;

@@ -9,6 +9,7 @@ use std::cmp::Reverse;
 use std::collections::BinaryHeap;
 
 /// Order of elimination and pattern of the factors.
+#[derive(Clone)]
 pub(super) struct Symbolic {
     /// State eliminated at each place.
     order: Vec<u32>,
@@ -19,6 +20,7 @@ pub(super) struct Symbolic {
 }
 
 /// Rows of places, rising, without the diagonal.
+#[derive(Clone)]
 struct Rows {
     offsets: Vec<usize>,
     columns: Vec<u32>,
@@ -138,6 +140,7 @@ fn merge(a: &[u32], clique: &[u32], u: u32, v: u32, out: &mut Vec<u32>) {
 }
 
 /// L (unit diagonal) and U of M in the order of a [`Symbolic`].
+#[derive(Clone)]
 pub(super) struct Factor {
     symbolic: Symbolic,
     upper: Vec<f64>,
@@ -185,33 +188,44 @@ impl Factor {
 
     /// x of M x = b or Mᵀ x = b.
     pub(super) fn solve(&self, b: &[f64], transposed: bool) -> Vec<f64> {
+        let (mut work, mut x) = (vec![0.0; b.len()], vec![0.0; b.len()]);
+        self.solve_into(b, transposed, &mut work, &mut x);
+        x
+    }
+
+    /// As [`Factor::solve`], in memory that the caller keeps; all of shape (`n_states`,).
+    pub(super) fn solve_into(&self, b: &[f64], transposed: bool, y: &mut [f64], x: &mut [f64]) {
         let symbolic = &self.symbolic;
         let n = b.len();
-        let mut y: Vec<f64> = symbolic.order.iter().map(|&state| b[state as usize]).collect();
+        for (y, &state) in y.iter_mut().zip(&symbolic.order) {
+            *y = b[state as usize];
+        }
         if transposed {
             for row in 0..n {
                 y[row] *= self.inverse_diagonal[row];
                 let range = symbolic.upper.range(row);
                 let known = y[row];
-                subtract(&mut y, known, &symbolic.upper.columns[range.clone()], &self.upper[range]);
+                subtract(y, known, &symbolic.upper.columns[range.clone()], &self.upper[range]);
             }
             for row in (0..n).rev() {
                 let range = symbolic.lower.range(row);
                 let known = y[row];
-                subtract(&mut y, known, &symbolic.lower.columns[range.clone()], &self.lower[range]);
+                subtract(y, known, &symbolic.lower.columns[range.clone()], &self.lower[range]);
             }
         } else {
             for row in 0..n {
                 let range = symbolic.lower.range(row);
-                y[row] -= product(&y, &symbolic.lower.columns[range.clone()], &self.lower[range]);
+                y[row] -= product(y, &symbolic.lower.columns[range.clone()], &self.lower[range]);
             }
             for row in (0..n).rev() {
                 let range = symbolic.upper.range(row);
-                y[row] -= product(&y, &symbolic.upper.columns[range.clone()], &self.upper[range]);
+                y[row] -= product(y, &symbolic.upper.columns[range.clone()], &self.upper[range]);
                 y[row] *= self.inverse_diagonal[row];
             }
         }
-        symbolic.place.iter().map(|&at| y[at as usize]).collect()
+        for (x, &at) in x.iter_mut().zip(&symbolic.place) {
+            *x = y[at as usize];
+        }
     }
 }
 

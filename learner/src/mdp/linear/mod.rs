@@ -11,11 +11,13 @@
 //! 1977), and the order of elimination is free. Deliberately absent: threads; one solve is one core's work.
 
 mod direct;
+mod factored;
 mod iterative;
 mod pattern;
 
 use super::tabular::TabularMdp;
 use direct::{Factor, Symbolic};
+pub(crate) use factored::Factored;
 use iterative::Incomplete;
 use pattern::Matrix;
 

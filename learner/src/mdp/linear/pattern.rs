@@ -4,6 +4,7 @@ use crate::mdp::TabularMdp;
 use crate::mdp::numeric::norm;
 
 /// Invariants: columns rise within a row; every row holds its diagonal entry.
+#[derive(Clone)]
 pub(super) struct Matrix {
     offsets: Vec<usize>,
     columns: Vec<u32>,

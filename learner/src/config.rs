@@ -34,6 +34,10 @@ pub struct Limits {
     /// Requests of one recording stream that wait for the disk; further ones wait on the wire
     #[arg(long, env = "MAZEWAY_LEARNER_MAX_IN_FLIGHT", default_value_t = 64, value_name = "N")]
     pub max_requests_in_flight: usize,
+    /// Bytes of the store in use from which recordings and models are refused; deleting, reading and fits go on [default:
+    /// as many as the disk has]
+    #[arg(long, env = "MAZEWAY_LEARNER_MAX_STORE_BYTES", value_name = "BYTES")]
+    pub max_store_bytes: Option<u64>,
     /// State-action pairs of one model
     #[arg(long, env = "MAZEWAY_LEARNER_MAX_MODEL_ROWS", default_value_t = 4_000_000, value_name = "N")]
     pub max_model_rows: u64,
@@ -68,6 +72,7 @@ impl Default for Limits {
             max_trajectories_per_request: 10_000,
             max_steps_per_trajectory: 1_000_000,
             max_requests_in_flight: 64,
+            max_store_bytes: None,
             max_model_rows: 4_000_000,
             max_model_transitions: 20_000_000,
             max_concurrent_fits: 2,

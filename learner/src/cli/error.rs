@@ -72,7 +72,7 @@ impl From<ClientError> for CliError {
                     "try again; what was acknowledged is stored"
                 }
                 Code::DataLoss => {
-                    "the data directory is damaged: restore it from a copy, or use another with --data DIR"
+                    "see what is damaged with 'learner verify'; 'learner repair' takes over what is sound"
                 }
                 _ => "set RUST_LOG=info to see more",
             },
@@ -87,8 +87,13 @@ impl From<StoreError> for CliError {
             StoreError::Directory { .. } | StoreError::Foreign { .. } => "use another directory with --data DIR",
             StoreError::NewerSchema { .. } => "install the newer release, or use another directory with --data DIR",
             StoreError::DiskFull { .. } => "free some disk space, or use another directory with --data DIR",
+            StoreError::QuotaReached { .. } => {
+                "delete recordings with 'learner delete', or raise --max-store-bytes where the service is started"
+            }
             StoreError::Busy { .. } => "stop the other program, or use another directory with --data DIR",
-            StoreError::Corrupt { .. } => "restore the directory from a copy, or use another with --data DIR",
+            StoreError::Corrupt { .. } => {
+                "see what is damaged with 'learner verify'; 'learner repair' takes over what is sound"
+            }
             StoreError::TrajectoryExists { .. }
             | StoreError::ModelExists { .. }
             | StoreError::AmbiguousFit { .. }

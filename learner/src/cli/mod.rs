@@ -11,6 +11,7 @@ mod export;
 pub mod fit;
 mod import;
 mod list;
+mod maintain;
 mod models;
 mod reproduce;
 mod scene;
@@ -50,6 +51,14 @@ enum Command {
     Export(export::ExportArgs),
     /// Delete trajectories or a fit
     Delete(export::DeleteArgs),
+    /// Check everything that is stored, and name what is damaged
+    Verify(maintain::MaintainArgs),
+    /// Make a sound store of a damaged one; the damaged file is kept
+    Repair(maintain::MaintainArgs),
+    /// Copy the store, which services may use meanwhile, and check the copy
+    Backup(maintain::BackupArgs),
+    /// Give the room that deleting has left back to the disk
+    Vacuum(maintain::MaintainArgs),
     /// Run the learner service
     Serve(serve::ServeArgs),
 }
@@ -118,6 +127,10 @@ async fn run(command: Command) -> Result<(), CliError> {
         Command::Show(args) => show::run(args).await,
         Command::Export(args) => export::export(args).await,
         Command::Delete(args) => export::delete(args).await,
+        Command::Verify(args) => maintain::verify(args).await,
+        Command::Repair(args) => maintain::repair(args).await,
+        Command::Backup(args) => maintain::backup(args).await,
+        Command::Vacuum(args) => maintain::vacuum(args).await,
         Command::Serve(args) => serve::run(args).await,
     }
 }

@@ -4,7 +4,11 @@
 //! never slows a fit; a fit whose caller has gone stops at its next iteration and is not stored.
 
 use super::{blocking, fit_job::FitJob, fit_job::progress_message, status::CallError};
-use crate::{config::Limits, irl::TraceEntry, store::Store};
+use crate::{
+    config::Limits,
+    irl::TraceEntry,
+    store::{Store, StoreError},
+};
 use mazeway_proto::learner::{self as pb, fit_response::Event};
 use std::{
     ops::ControlFlow,
@@ -108,7 +112,16 @@ async fn run(
     if cancelled() {
         return Err(CallError::Cancelled);
     }
-    Ok(store.put_fit(fit).await?)
+    let mut unstored = fit.clone();
+    match store.put_fit(fit).await {
+        Err(error @ StoreError::DiskFull { .. }) => {
+            // What was worked out is given all the same.
+            tracing::warn!(%error, fit_id = unstored.fit_id, "a fit could not be stored");
+            unstored.warnings.push("this fit is not stored: the disk is full".into());
+            Ok(unstored)
+        }
+        stored => Ok(stored?),
+    }
 }
 
 fn response(event: Event) -> pb::FitResponse {

@@ -3,7 +3,7 @@
 use super::service::LearnerGrpc;
 use crate::{
     config::Config,
-    store::{Store, StoreError},
+    store::{Store, StoreError, StoreOptions},
 };
 use mazeway_proto::learner::learner_service_server::LearnerServiceServer;
 use std::{future::Future, time::Duration};
@@ -44,7 +44,9 @@ pub async fn serve(
     shutdown: impl Future<Output = ()>,
 ) -> Result<(), ServeError> {
     let data = config.data.clone();
-    let store = spawn_blocking(move || Store::open(&data)).await.unwrap_or(Err(StoreError::Closed))?;
+    let options = StoreOptions { max_bytes: config.limits.max_store_bytes, ..StoreOptions::default() };
+    let opening = spawn_blocking(move || Store::open_with(&data, options));
+    let store = opening.await.unwrap_or(Err(StoreError::Closed))?;
     let outcome = serve_store(config, store.clone(), listener, shutdown).await;
     // The last clone waits for the writer.
     let _ = spawn_blocking(move || drop(store)).await;

@@ -128,6 +128,10 @@ fn store_code(error: &StoreError, message: &str, details: &mut ErrorDetails) -> 
             details.add_quota_failure_violation("disk", message);
             Code::ResourceExhausted
         }
+        StoreError::QuotaReached { .. } => {
+            details.add_quota_failure_violation("max_store_bytes", message);
+            Code::ResourceExhausted
+        }
         StoreError::Busy { .. } | StoreError::Closed => Code::Unavailable,
         StoreError::Corrupt { .. } => Code::DataLoss,
         StoreError::Directory { .. }

@@ -67,6 +67,14 @@ pub enum StoreError {
         /// The database.
         path: PathBuf,
     },
+    /// The store holds as much as it may, and what was to be stored is more.
+    #[error("the store may hold {limit} bytes and would hold {used}; delete recordings, or raise the limit")]
+    QuotaReached {
+        /// Bytes that it may hold.
+        limit: u64,
+        /// Bytes that it would hold.
+        used: u64,
+    },
     /// Another process held the database for longer than the busy timeout.
     #[error("{path} is locked by another process")]
     Busy {

@@ -83,6 +83,15 @@ pub(super) fn get(connection: &Connection, path: &Path, prefix: &str) -> Result<
     }
 }
 
+/// Reads the fit of a row, and checks that it is what the row says.
+pub(super) fn by_row(connection: &Connection, path: &Path, seq: i64) -> Result<Option<pb::Fit>, StoreError> {
+    let found = connection.query_row("SELECT fit_id FROM fits WHERE seq = ?", [seq], |row| row.get::<_, String>(0));
+    let Some(fit_id) = found.optional().map_err(|e| StoreError::from_sqlite(path, &e))? else { return Ok(None) };
+    let corrupt = |message: &str| StoreError::Corrupt { what: format!("fit {fit_id}"), message: message.into() };
+    let fit = get(connection, path, &fit_id)?.ok_or_else(|| corrupt("it is not found by its id"))?;
+    if fit.fit_id == fit_id { Ok(Some(fit)) } else { Err(corrupt("its document is that of another fit")) }
+}
+
 /// Lists fits, newest first, from before `before` on; empty labels mean any.
 pub(super) fn list(
     connection: &Connection,

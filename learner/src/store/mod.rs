@@ -8,11 +8,15 @@
 //! Deliberately absent: the wire (see `grpc`), and any change of what is stored; there is recording and
 //! deleting.
 
+mod backup;
+mod check;
 mod error;
 mod filter;
 mod fits;
 mod models;
+mod options;
 mod recording;
+mod repair;
 mod schema;
 mod trajectories;
 mod writer;
@@ -20,14 +24,18 @@ mod writer;
 #[cfg(test)]
 mod tests;
 
+pub use backup::backup;
+pub use check::{Damage, Kind, Tally, Verification, verify};
 pub use error::StoreError;
 pub use filter::Filter;
 pub use fits::FitInfo;
 pub use models::{Model, ModelInfo, Put, Rows, check_header};
+pub use options::StoreOptions;
 pub use recording::{
     Arrays, Collection, FieldError, MAX_LABEL_BYTES, Recording, check_label, check_model_id, clip, pack_f64, pack_u32,
     unpack_f64, unpack_u32,
 };
+pub use repair::{Repair, repair};
 pub use schema::FILE_NAME;
 pub use trajectories::{Cursor, TrajectorySummary};
 pub use writer::Pending;
@@ -35,6 +43,7 @@ pub use writer::Pending;
 use mazeway_proto::learner as pb;
 use rusqlite::Connection;
 use std::{
+    fs::File,
     ops::{ControlFlow, Deref},
     path::{Path, PathBuf},
     sync::{Arc, Mutex, PoisonError},
@@ -60,18 +69,32 @@ pub struct Store(Arc<Inner>);
 #[derive(Debug)]
 struct Inner {
     path: PathBuf,
+    options: StoreOptions,
+    // Dropped in this order: the last connection goes before the sign that somebody uses the directory.
+    readers: Mutex<Vec<Connection>>,
     writer: Writer,
     pending: Arc<Semaphore>,
-    readers: Mutex<Vec<Connection>>,
+    _user: File,
 }
 
 impl Store {
     /// Opens the store of a directory, made where it is missing. Blocks.
     pub fn open(directory: &Path) -> Result<Self, StoreError> {
-        let (path, connection) = schema::open(directory)?;
+        Self::open_with(directory, StoreOptions::default())
+    }
+
+    /// As [`Store::open`], with options. Blocks.
+    pub fn open_with(directory: &Path, options: StoreOptions) -> Result<Self, StoreError> {
+        let schema::Opened { path, connection, user } = schema::open(directory, &options)?;
         let writer = Writer::start(connection, path.clone())?;
         let pending = Arc::new(Semaphore::new(PENDING_BYTES / PENDING_UNIT));
-        Ok(Self(Arc::new(Inner { path, writer, pending, readers: Mutex::default() })))
+        Ok(Self(Arc::new(Inner { path, options, readers: Mutex::default(), writer, pending, _user: user })))
+    }
+
+    /// As [`Store::open`], where there is a store already. Blocks.
+    pub fn open_existing(directory: &Path) -> Result<Self, StoreError> {
+        drop(schema::open_existing(&directory.join(schema::FILE_NAME))?);
+        Self::open(directory)
     }
 
     /// The database file.
@@ -93,12 +116,16 @@ impl Store {
         let units = bytes.div_ceil(PENDING_UNIT).clamp(1, PENDING_BYTES / PENDING_UNIT);
         let pending = Arc::clone(&self.0.pending);
         let pending = pending.acquire_many_owned(units as u32).await.map_err(|_| StoreError::Closed)?;
+        let quota = self.0.options.max_bytes;
         let job = move |work: &mut writer::Work<'_>| {
             let _pending = pending;
             let mut stored = 0;
             for (index, recording) in recordings.iter().enumerate() {
                 let new = trajectories::insert(work.connection, work.path, work.collections, recording, index)?;
                 stored += u32::from(new);
+            }
+            if stored > 0 {
+                check_quota(work, quota)?;
             }
             Ok(stored)
         };
@@ -115,7 +142,14 @@ impl Store {
     /// # Errors
     /// [`StoreError::ModelExists`] where the rows are stored with another header, which is not to be replaced.
     pub async fn put_model(&self, model: Model, replace: bool) -> Result<Put, StoreError> {
-        let job = move |work: &mut writer::Work<'_>| models::insert(work.connection, work.path, &model, replace);
+        let quota = self.0.options.max_bytes;
+        let job = move |work: &mut writer::Work<'_>| {
+            let put = models::insert(work.connection, work.path, &model, replace)?;
+            if put != Put::Known {
+                check_quota(work, quota)?;
+            }
+            Ok(put)
+        };
         self.0.writer.queue(job).await?.committed().await
     }
 
@@ -133,6 +167,20 @@ impl Store {
     /// Deletes a fit by its whole id and says whether there was one.
     pub async fn delete_fit(&self, fit_id: String) -> Result<bool, StoreError> {
         self.write(move |connection| fits::delete(connection, &fit_id)).await
+    }
+
+    /// Writes the database anew without the room that deleting has left, and gives that back to the disk. Needs as much
+    /// room again while it works. Recordings wait meanwhile.
+    pub async fn vacuum(&self) -> Result<(), StoreError> {
+        self.0.writer.queue_alone(|connection| connection.execute_batch("VACUUM")).await?;
+        self.checkpoint().await
+    }
+
+    /// Writes the write-ahead log back into the database and empties it, as far as no reader needs it.
+    pub async fn checkpoint(&self) -> Result<(), StoreError> {
+        let checkpoint =
+            |connection: &Connection| connection.query_row("PRAGMA wal_checkpoint(TRUNCATE)", [], |_| Ok(()));
+        self.0.writer.queue_alone(checkpoint).await
     }
 
     async fn write<T: Send + 'static>(
@@ -211,6 +259,11 @@ impl Store {
         self.read(|connection| fits::list(connection, env_id, style, before, limit))
     }
 
+    /// What SQLite finds wrong with the structure of the database: pages, order of keys, indices. Blocks.
+    pub fn check_structure(&self) -> Result<Vec<String>, StoreError> {
+        self.read(check::structure)
+    }
+
     fn read<T>(&self, query: impl FnOnce(&Connection) -> rusqlite::Result<T>) -> Result<T, StoreError> {
         query(&*self.reader()?).map_err(|e| StoreError::from_sqlite(self.path(), &e))
     }
@@ -219,10 +272,19 @@ impl Store {
         let idle = self.0.readers.lock().unwrap_or_else(PoisonError::into_inner).pop();
         let connection = match idle {
             Some(connection) => connection,
-            None => schema::open_reader(self.path())?,
+            None => schema::open_reader(self.path(), &self.0.options)?,
         };
         Ok(Reader { connection: Some(connection), idle: &self.0.readers })
     }
+}
+
+/// Refuses what a job has written where it is more than the quota: its savepoint takes it back.
+fn check_quota(work: &writer::Work<'_>, max_bytes: Option<u64>) -> Result<(), StoreError> {
+    let Some(limit) = max_bytes else { return Ok(()) };
+    let number = |pragma| work.connection.pragma_query_value(None, pragma, |row| row.get::<_, i64>(0));
+    let used = (|| Ok((number("page_count")? - number("freelist_count")?) * number("page_size")?))();
+    let used = used.map_err(|e| StoreError::from_sqlite(work.path, &e))? as u64;
+    if used > limit { Err(StoreError::QuotaReached { limit, used }) } else { Ok(()) }
 }
 
 fn next_page(connection: &Connection, path: &Path, cursor: &mut Cursor) -> Result<Vec<Recording>, StoreError> {

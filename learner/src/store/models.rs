@@ -371,6 +371,23 @@ pub(super) fn get(connection: &Connection, path: &Path, model_id: &str) -> Resul
     found.map(|(document, rows)| Ok(Model { header: decode_header(document, model_id)?, rows })).transpose()
 }
 
+/// Reads the model of a row, checks it as if it came from outside, and tells when it was stored.
+pub(super) fn by_row(connection: &Connection, path: &Path, row: i64) -> Result<Option<(i64, Model)>, StoreError> {
+    let fail = |e: rusqlite::Error| StoreError::from_sqlite(path, &e);
+    let sql = "SELECT model_id, stored_at FROM models WHERE rowid = ?";
+    let found = connection.query_row(sql, [row], |row| Ok((row.get::<_, String>(0)?, row.get(1)?))).optional();
+    let Some((model_id, stored_at)) = found.map_err(fail)? else { return Ok(None) };
+    let corrupt = |message: String| StoreError::Corrupt { what: format!("model {model_id}"), message };
+    let Some(model) = get(connection, path, &model_id)? else {
+        return Err(corrupt("it is not found by its id".into()));
+    };
+    if model.header.model_id != model_id {
+        return Err(corrupt(format!("its header is that of {:?}", clip(&model.header.model_id))));
+    }
+    let model = Model::new(model.header, model.rows).map_err(|error| corrupt(error.to_string()))?;
+    Ok(Some((stored_at, model)))
+}
+
 /// Lists models in the order of their ids; an empty `env_id` means any.
 pub(super) fn list(connection: &Connection, path: &Path, env_id: &str) -> Result<Vec<ModelInfo>, StoreError> {
     let fail = |e: rusqlite::Error| StoreError::from_sqlite(path, &e);

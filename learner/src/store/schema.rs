@@ -3,11 +3,12 @@
 //! Invariants: a migration, once released, never changes; a schema newer than this release is refused, not guessed at;
 //! opening and migrating happen under a lock on a file beside the database, so several processes may start at once.
 
-use super::StoreError;
-use rusqlite::{Connection, OpenFlags};
+use super::{StoreError, StoreOptions};
+use rusqlite::{Connection, OpenFlags, config::DbConfig};
 use rusqlite_migration::{M, Migrations};
 use std::{
-    fs::{self, File},
+    fs::{self, File, TryLockError},
+    io,
     path::{Path, PathBuf},
     time::Duration,
 };
@@ -87,37 +88,134 @@ PRAGMA application_id = 0x4d5a5759;
 
 const MIGRATIONS: &[M<'static>] = &[M::up(V1)];
 
-/// Makes the directory and the database where they are missing, brings the schema up to date, and returns the path of
-/// the database and a connection for writing.
-pub fn open(directory: &Path) -> Result<(PathBuf, Connection), StoreError> {
-    let fail = |e: std::io::Error| StoreError::directory(directory, &e);
-    fs::create_dir_all(directory).map_err(fail)?;
-    let lock =
-        File::options().create(true).truncate(false).write(true).open(directory.join("mazeway.lock")).map_err(fail)?;
-    lock.lock().map_err(fail)?;
+/// Locked while a store is opened, so that one process at a time makes and migrates it.
+const OPENING_FILE: &str = "mazeway.lock";
+/// Locked, shared, as long as a store is open: whoever can lock it for himself is alone.
+const USERS_FILE: &str = "mazeway.users";
+
+/// A database that is open for writing.
+#[derive(Debug)]
+pub struct Opened {
+    /// The database.
+    pub path: PathBuf,
+    /// For writing.
+    pub connection: Connection,
+    /// Says that somebody uses the directory, as long as it is not dropped.
+    pub user: File,
+}
+
+/// Makes the directory and the database where they are missing and brings the schema up to date.
+pub fn open(directory: &Path, options: &StoreOptions) -> Result<Opened, StoreError> {
+    make_directory(directory).map_err(|e| StoreError::directory(directory, &e))?;
+    let opening = lock_file(directory, OPENING_FILE)?;
+    opening.lock().map_err(|e| StoreError::directory(directory, &e))?;
+    let user = lock_file(directory, USERS_FILE)?;
+    match user.try_lock_shared() {
+        Ok(()) => {}
+        Err(TryLockError::WouldBlock) => return Err(StoreError::Busy { path: directory.join(FILE_NAME) }),
+        Err(TryLockError::Error(error)) => return Err(StoreError::directory(directory, &error)),
+    }
     let path = directory.join(FILE_NAME);
-    let sqlite = |e: rusqlite::Error| StoreError::from_sqlite(&path, &e);
-    let mut connection = Connection::open(&path).map_err(sqlite)?;
+    let connection = open_database(&path, options)?;
+    Ok(Opened { path, connection, user })
+}
+
+/// Keeps every other process from the store of a directory until it is dropped.
+///
+/// # Errors
+/// [`StoreError::Busy`] where one has it open.
+pub fn lock_alone(directory: &Path) -> Result<(File, File), StoreError> {
+    let opening = lock_file(directory, OPENING_FILE)?;
+    opening.lock().map_err(|e| StoreError::directory(directory, &e))?;
+    let user = lock_file(directory, USERS_FILE)?;
+    match user.try_lock() {
+        Ok(()) => Ok((opening, user)),
+        Err(TryLockError::WouldBlock) => Err(StoreError::Busy { path: directory.join(FILE_NAME) }),
+        Err(TryLockError::Error(error)) => Err(StoreError::directory(directory, &error)),
+    }
+}
+
+fn lock_file(directory: &Path, name: &str) -> Result<File, StoreError> {
+    let file = File::options().create(true).truncate(false).write(true).open(directory.join(name));
+    file.map_err(|e| StoreError::directory(directory, &e))
+}
+
+/// Makes a directory and its parents where they are missing; their names are on stable storage when this returns. SQLite
+/// sees to the names of its files in the directory, but not to that of the directory.
+pub fn make_directory(directory: &Path) -> io::Result<()> {
+    if directory.is_dir() {
+        return Ok(());
+    }
+    let parent = directory.parent().filter(|parent| !parent.as_os_str().is_empty());
+    if let Some(parent) = parent {
+        make_directory(parent)?;
+    }
+    match fs::create_dir(directory) {
+        // Somebody else was faster.
+        Err(error) if error.kind() == io::ErrorKind::AlreadyExists && directory.is_dir() => {}
+        made => made?,
+    }
+    sync_directory(parent.unwrap_or(Path::new(".")))
+}
+
+/// Puts the names of a directory's files on stable storage, where the platform can.
+pub fn sync_directory(directory: &Path) -> io::Result<()> {
+    if cfg!(unix) { File::open(directory)?.sync_all() } else { Ok(()) }
+}
+
+/// A database for writing, made where it is missing and brought up to date.
+pub fn open_database(path: &Path, options: &StoreOptions) -> Result<Connection, StoreError> {
+    let sqlite = |e: rusqlite::Error| StoreError::from_sqlite(path, &e);
+    let flags = OpenFlags::SQLITE_OPEN_READ_WRITE | OpenFlags::SQLITE_OPEN_CREATE | OpenFlags::SQLITE_OPEN_NO_MUTEX;
+    let mut connection = connect(path, flags, options).map_err(sqlite)?;
     connection.busy_timeout(BUSY_TIMEOUT).map_err(sqlite)?;
-    check_owner(&path, &connection)?;
+    check_owner(path, &connection)?;
     // FULL makes a commit in WAL mode wait for the disk; `fullfsync` makes macOS mean it.
     connection.pragma_update(None, "journal_mode", "WAL").map_err(sqlite)?;
     connection.pragma_update(None, "synchronous", "FULL").map_err(sqlite)?;
     connection.pragma_update(None, "fullfsync", true).map_err(sqlite)?;
     connection.pragma_update(None, "foreign_keys", true).map_err(sqlite)?;
+    if let Some(pages) = options.checkpoint_pages {
+        connection.pragma_update(None, "wal_autocheckpoint", pages).map_err(sqlite)?;
+    }
     Migrations::from_slice(MIGRATIONS).to_latest(&mut connection).map_err(|error| match error {
-        rusqlite_migration::Error::RusqliteError { err, .. } => StoreError::from_sqlite(&path, &err),
-        other => StoreError::Database { path: path.clone(), message: other.to_string() },
+        rusqlite_migration::Error::RusqliteError { err, .. } => StoreError::from_sqlite(path, &err),
+        other => StoreError::Database { path: path.to_owned(), message: other.to_string() },
     })?;
-    drop(lock);
-    Ok((path, connection))
+    Ok(connection)
+}
+
+fn connect(path: &Path, flags: OpenFlags, options: &StoreOptions) -> rusqlite::Result<Connection> {
+    match &options.vfs {
+        Some(vfs) => Connection::open_with_flags_and_vfs(path, flags, vfs.as_str()),
+        None => Connection::open_with_flags(path, flags),
+    }
+}
+
+/// Opens a database that is there, as it is: to look at it, not to bring it up to date.
+///
+/// # Errors
+/// There is none; it is a newer release's or another program's; it is no database.
+pub fn open_existing(path: &Path) -> Result<Connection, StoreError> {
+    if !path.is_file() {
+        let directory = path.parent().unwrap_or(path);
+        let error = io::Error::new(io::ErrorKind::NotFound, format!("it holds no {FILE_NAME}"));
+        return Err(StoreError::directory(directory, &error));
+    }
+    let connection = open_reader(path, &StoreOptions::default())?;
+    // What is looked at is left alone: its log is not written back into it.
+    connection
+        .set_db_config(DbConfig::SQLITE_DBCONFIG_NO_CKPT_ON_CLOSE, true)
+        .map_err(|e| StoreError::from_sqlite(path, &e))?;
+    check_owner(path, &connection)?;
+    Ok(connection)
 }
 
 /// A connection that only reads; it sees the last commit at the start of each of its statements or transactions.
-pub fn open_reader(path: &Path) -> Result<Connection, StoreError> {
+pub fn open_reader(path: &Path, options: &StoreOptions) -> Result<Connection, StoreError> {
     let sqlite = |e: rusqlite::Error| StoreError::from_sqlite(path, &e);
     let flags = OpenFlags::SQLITE_OPEN_READ_WRITE | OpenFlags::SQLITE_OPEN_NO_MUTEX;
-    let connection = Connection::open_with_flags(path, flags).map_err(sqlite)?;
+    let connection = connect(path, flags, options).map_err(sqlite)?;
     connection.busy_timeout(BUSY_TIMEOUT).map_err(sqlite)?;
     connection.pragma_update(None, "query_only", true).map_err(sqlite)?;
     Ok(connection)
@@ -143,6 +241,25 @@ fn check_owner(path: &Path, connection: &Connection) -> Result<(), StoreError> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    fn open(directory: &Path) -> Result<(PathBuf, Connection), StoreError> {
+        super::open(directory, &StoreOptions::default()).map(|opened| (opened.path, opened.connection))
+    }
+
+    #[test]
+    fn who_has_a_store_open_is_not_alone() {
+        let directory = tempfile::tempdir().unwrap();
+        let nested = directory.path().join("a").join("b");
+        let users = [
+            super::open(&nested, &StoreOptions::default()).unwrap(),
+            super::open(&nested, &StoreOptions::default()).unwrap(),
+        ];
+        assert!(matches!(lock_alone(&nested).unwrap_err(), StoreError::Busy { .. }));
+        drop(users);
+        let alone = lock_alone(&nested).unwrap();
+        drop(alone);
+        open(&nested).unwrap();
+    }
 
     #[test]
     fn migrations_are_sound() {

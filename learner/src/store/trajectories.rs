@@ -11,7 +11,8 @@ use std::{collections::HashMap, path::Path};
 use uuid::Uuid;
 
 /// What [`Cursor::page`] reads of a row, the rewards last.
-const COLUMNS: &str = "seq, trajectory_id, collection, seed, final_state, terminated, truncated, states, actions";
+const COLUMNS: &str =
+    "seq, trajectory_id, collection, seed, final_state, terminated, truncated, content_hash, states, actions";
 /// Rows that a page of whole trajectories holds at most.
 const PAGE_ROWS: usize = 512;
 
@@ -164,6 +165,8 @@ pub struct Cursor {
     collections: Collections,
     /// What is read in the place of the rewards.
     rewards: &'static str,
+    /// Whether all is read that the hash is of.
+    whole: bool,
 }
 
 #[derive(Debug)]
@@ -186,12 +189,12 @@ impl Cursor {
             let rows = statement.query_map(params_from_iter(condition.values()), |row| row.get(0))?;
             Place::Rows(rows.collect::<rusqlite::Result<_>>()?)
         };
-        Ok(Self { place, collections: Collections::default(), rewards: "rewards" })
+        Ok(Self { place, collections: Collections::default(), rewards: "rewards", whole: true })
     }
 
     /// Leaves the rewards on the disk, where they are half of what there is to read: trajectories come without.
     pub(super) fn without_rewards(self) -> Self {
-        Self { rewards: "x''", ..self }
+        Self { rewards: "x''", whole: false, ..self }
     }
 
     /// The next trajectories: at least one unless there are no more, then so many as fit into `max_bytes`.
@@ -271,11 +274,16 @@ impl Cursor {
             final_state: row.get(4)?,
             terminated: row.get(5)?,
             truncated: row.get(6)?,
-            states: blob(7)?,
-            actions: blob(8)?,
-            rewards: blob(9)?,
+            states: blob(8)?,
+            actions: blob(9)?,
+            rewards: blob(10)?,
         };
-        Ok(Ok(Recording::from_stored(id, collection, seed, arrays)))
+        let recording = Recording::from_stored(id, collection, seed, arrays);
+        if self.whole && row.get_ref(7)?.as_blob()? != recording.content_hash() {
+            let message = "its content is not what was stored: the hashes differ".into();
+            return Ok(Err(StoreError::Corrupt { what: format!("trajectory {id}"), message }));
+        }
+        Ok(Ok(recording))
     }
 }
 
@@ -288,21 +296,26 @@ impl Collections {
         if let Some(collection) = self.0.get(&id) {
             return Ok(collection.clone());
         }
-        let collection = connection.query_row(
-            "SELECT env_id, model_id, style, source, n_states, n_actions FROM collections WHERE id = ?",
-            [id],
-            |row| {
-                Ok(Collection {
-                    env_id: row.get(0)?,
-                    model_id: row.get(1)?,
-                    style: row.get(2)?,
-                    source: row.get(3)?,
-                    n_states: row.get(4)?,
-                    n_actions: row.get(5)?,
-                })
-            },
-        )?;
+        let collection = collection(connection, id)?;
         self.0.insert(id, collection.clone());
         Ok(collection)
     }
+}
+
+/// Reads a collection by its row.
+pub(super) fn collection(connection: &Connection, row: i64) -> rusqlite::Result<Collection> {
+    connection.query_row(
+        "SELECT env_id, model_id, style, source, n_states, n_actions FROM collections WHERE id = ?",
+        [row],
+        |row| {
+            Ok(Collection {
+                env_id: row.get(0)?,
+                model_id: row.get(1)?,
+                style: row.get(2)?,
+                source: row.get(3)?,
+                n_states: row.get(4)?,
+                n_actions: row.get(5)?,
+            })
+        },
+    )
 }

@@ -29,11 +29,22 @@ pub(super) struct Work<'a> {
 /// Tells the caller how it went, once it is known how the commit went.
 type Answer = Box<dyn FnOnce(Result<(), StoreError>) + Send>;
 /// Runs in a transaction, or hears that there is none.
-type Job = Box<dyn FnOnce(Result<&mut Work<'_>, StoreError>) -> Answer + Send>;
+type Shared = Box<dyn FnOnce(Result<&mut Work<'_>, StoreError>) -> Answer + Send>;
+/// Runs between transactions.
+type Alone = Box<dyn FnOnce(&Connection) + Send>;
+
+/// What the writing thread is asked for.
+enum Job {
+    /// Shares a transaction with others.
+    Shared(Shared),
+    /// Cannot run in a transaction.
+    Alone(Alone),
+}
 
 /// Takes jobs to the writing thread.
 #[derive(Debug)]
 pub(super) struct Writer {
+    path: PathBuf,
     jobs: Option<mpsc::Sender<Job>>,
     thread: Option<thread::JoinHandle<()>>,
 }
@@ -48,7 +59,7 @@ impl Writer {
                 move || write(connection, &path, queue)
             })
             .map_err(|e| StoreError::directory(&path, &e))?;
-        Ok(Self { jobs: Some(jobs), thread: Some(thread) })
+        Ok(Self { path, jobs: Some(jobs), thread: Some(thread) })
     }
 
     /// Queues `job` for a transaction, behind all that was queued before. What it gives is the job's result once that
@@ -58,16 +69,35 @@ impl Writer {
         job: impl FnOnce(&mut Work<'_>) -> Result<T, StoreError> + Send + 'static,
     ) -> Result<Pending<T>, StoreError> {
         let (answer, result) = oneshot::channel();
-        let job: Job = Box::new(move |work| {
+        let job: Shared = Box::new(move |work| {
             let outcome = work.and_then(|work| in_savepoint(work, job));
             Box::new(move |commit| {
                 // A caller that has gone does not want its answer.
                 let _ = answer.send(outcome.and_then(|value| commit.map(|()| value)));
             })
         });
-        let jobs = self.jobs.as_ref().ok_or(StoreError::Closed)?;
-        jobs.send(job).await.map_err(|_| StoreError::Closed)?;
+        self.send(Job::Shared(job)).await?;
         Ok(Pending(result))
+    }
+
+    /// Runs `job` outside any transaction, behind all that was queued before.
+    pub(super) async fn queue_alone(
+        &self,
+        job: impl FnOnce(&Connection) -> rusqlite::Result<()> + Send + 'static,
+    ) -> Result<(), StoreError> {
+        let (answer, result) = oneshot::channel();
+        let path = self.path.clone();
+        let job: Alone = Box::new(move |connection| {
+            // A caller that has gone does not want its answer.
+            let _ = answer.send(job(connection).map_err(|e| StoreError::from_sqlite(&path, &e)));
+        });
+        self.send(Job::Alone(job)).await?;
+        result.await.map_err(|_| StoreError::Closed)?
+    }
+
+    async fn send(&self, job: Job) -> Result<(), StoreError> {
+        let jobs = self.jobs.as_ref().ok_or(StoreError::Closed)?;
+        jobs.send(job).await.map_err(|_| StoreError::Closed)
     }
 }
 
@@ -96,9 +126,26 @@ impl Drop for Writer {
 
 fn write(mut connection: Connection, path: &Path, mut queue: mpsc::Receiver<Job>) {
     let mut collections = CollectionCache::new();
-    while let Some(first) = queue.blocking_recv() {
+    let mut next = None;
+    while let Some(job) = next.take().or_else(|| queue.blocking_recv()) {
+        let first = match job {
+            Job::Shared(first) => first,
+            Job::Alone(job) => {
+                job(&connection);
+                continue;
+            }
+        };
         let mut answers = Vec::new();
-        let result = commit_together(&mut connection, path, &mut collections, first, &mut queue, &mut answers);
+        let more = || match queue.try_recv() {
+            Ok(Job::Shared(job)) => Some(job),
+            // Its turn comes after the commit.
+            Ok(alone @ Job::Alone(_)) => {
+                next = Some(alone);
+                None
+            }
+            Err(_) => None,
+        };
+        let result = commit_together(&mut connection, path, &mut collections, first, more, &mut answers);
         if let Err(error) = &result {
             tracing::error!(%error, jobs = answers.len(), "a commit failed");
             // Rows of collections that were made in it are gone.
@@ -114,8 +161,8 @@ fn commit_together(
     connection: &mut Connection,
     path: &Path,
     collections: &mut CollectionCache,
-    first: Job,
-    queue: &mut mpsc::Receiver<Job>,
+    first: Shared,
+    mut more: impl FnMut() -> Option<Shared>,
     answers: &mut Vec<Answer>,
 ) -> Result<(), StoreError> {
     let fail = |e: rusqlite::Error| StoreError::from_sqlite(path, &e);
@@ -140,9 +187,9 @@ fn commit_together(
         if answers.len() >= JOBS_A_COMMIT {
             break;
         }
-        match queue.try_recv() {
-            Ok(next) => job = next,
-            Err(_) => break,
+        match more() {
+            Some(next) => job = next,
+            None => break,
         }
     }
     transaction.commit().map_err(fail)

@@ -1,0 +1,321 @@
+//! Is what is stored what was stored? And what can still be read of a file that is damaged?
+//!
+//! Structure is SQLite's: its `integrity_check` looks at pages, order of keys and indices. Contents are ours: a trajectory
+//! is checked against the SHA-256 that it was stored with, a model against its id, which is its SHA-256, a fit by decoding.
+//! Rows are read one by one, by every key that any index or the table itself still tells, so that a page that does not
+//! read costs the rows that lie on it and no others.
+
+use super::{
+    Arrays, Collection, Model, Recording, StoreError, filter::stored_uuid, fits, models, schema, trajectories,
+};
+use bytes::Bytes;
+use rusqlite::Connection;
+use std::{
+    collections::HashMap,
+    path::{Path, PathBuf},
+};
+
+/// Findings of SQLite's that are told at most.
+const MAX_FINDINGS: u32 = 100;
+/// Damaged things that are named at most, of each kind; all are counted.
+const MAX_NAMED: usize = 10_000;
+/// Keys that are tried at most where some may not be known.
+const MAX_GUESSED: i64 = 50_000_000;
+/// Keys beyond the last known one that are tried.
+const BEYOND: i64 = 10_000;
+
+/// How many of a kind were looked at.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize)]
+pub struct Tally {
+    /// They are what was stored.
+    pub sound: u64,
+    /// They are not, or do not read.
+    pub damaged: u64,
+}
+
+/// What a thing is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Kind {
+    /// A trajectory.
+    Trajectory,
+    /// A model.
+    Model,
+    /// A fit.
+    Fit,
+}
+
+/// One thing that is not what was stored, or does not read.
+#[derive(Debug, Clone, PartialEq, Eq, serde::Serialize)]
+pub struct Damage {
+    /// What it is.
+    pub kind: Kind,
+    /// Its id, or its row where the id does not read.
+    pub name: String,
+    /// What is wrong.
+    pub message: String,
+}
+
+/// What was found in a store.
+#[derive(Debug, Clone, PartialEq, Eq, Default, serde::Serialize)]
+pub struct Verification {
+    /// The database.
+    pub path: PathBuf,
+    /// Version of its schema.
+    pub schema: i64,
+    /// What is wrong with its structure.
+    pub structure: Vec<String>,
+    /// Trajectories.
+    pub trajectories: Tally,
+    /// Models.
+    pub models: Tally,
+    /// Fits.
+    pub fits: Tally,
+    /// The damaged ones by name.
+    pub damage: Vec<Damage>,
+}
+
+impl Verification {
+    /// Whether nothing is wrong.
+    pub fn is_sound(&self) -> bool {
+        self.structure.is_empty() && [self.trajectories, self.models, self.fits].iter().all(|tally| tally.damaged == 0)
+    }
+
+    fn count(&mut self, kind: Kind, outcome: Result<(), (String, StoreError)>) {
+        let tally = match kind {
+            Kind::Trajectory => &mut self.trajectories,
+            Kind::Model => &mut self.models,
+            Kind::Fit => &mut self.fits,
+        };
+        match outcome {
+            Ok(()) => tally.sound += 1,
+            Err((name, error)) => {
+                tally.damaged += 1;
+                if tally.damaged <= MAX_NAMED as u64 {
+                    self.damage.push(Damage { kind, name, message: error.to_string() });
+                }
+            }
+        }
+    }
+}
+
+/// A thing that is what was stored.
+#[derive(Debug)]
+pub enum Sound<'a> {
+    /// A trajectory, its place in the order of recording and when it was recorded.
+    Trajectory { seq: i64, recorded_at_us: i64, recording: &'a Recording },
+    /// A model and when it was stored.
+    Model { stored_at_us: i64, model: &'a Model },
+    /// A fit, by its row.
+    Fit { row: i64 },
+}
+
+/// Reads everything that a store holds and checks it. A service may be at work on it meanwhile. Blocks.
+///
+/// # Errors
+/// There is no store; it is a newer release's or another program's.
+pub fn verify(directory: &Path) -> Result<Verification, StoreError> {
+    let path = directory.join(schema::FILE_NAME);
+    let connection = match schema::open_existing(&path) {
+        Err(StoreError::Corrupt { message, .. }) => {
+            return Ok(Verification { path, structure: vec![message], ..Verification::default() });
+        }
+        opened => opened?,
+    };
+    walk(&connection, &path, |_| Ok(()))
+}
+
+/// What SQLite finds wrong with the structure of the database.
+pub(super) fn structure(connection: &Connection) -> rusqlite::Result<Vec<String>> {
+    let mut statement = connection.prepare(&format!("PRAGMA integrity_check({MAX_FINDINGS})"))?;
+    let findings = statement.query_map([], |row| row.get::<_, String>(0))?.collect::<rusqlite::Result<Vec<_>>>()?;
+    Ok(findings.into_iter().filter(|finding| finding != "ok").collect())
+}
+
+/// Checks everything, as it stands at the first, and calls `visit` with what is sound, trajectories in their order.
+///
+/// # Errors
+/// Those of `visit`.
+pub(super) fn walk(
+    connection: &Connection,
+    path: &Path,
+    mut visit: impl FnMut(Sound<'_>) -> Result<(), StoreError>,
+) -> Result<Verification, StoreError> {
+    let corrupt = |error: &rusqlite::Error| StoreError::from_sqlite(path, error);
+    let snapshot = connection.unchecked_transaction().map_err(|e| corrupt(&e))?;
+    let mut found = Verification { path: path.to_owned(), ..Verification::default() };
+    match snapshot.pragma_query_value(None, "user_version", |row| row.get(0)) {
+        Ok(version) => found.schema = version,
+        Err(error) => found.structure.push(error.to_string()),
+    }
+    match structure(&snapshot) {
+        Ok(findings) => found.structure.extend(findings),
+        Err(error) => found.structure.push(error.to_string()),
+    }
+    let whole = found.structure.is_empty();
+
+    let names = if whole { HashMap::new() } else { names(&snapshot) };
+    let mut collections = HashMap::new();
+    let keys = Keys::new(&snapshot, "trajectories", "seq", &["trajectories_by_collection"], whole);
+    keys.try_for_each(|key, known| {
+        let name = || names.get(&key).cloned().unwrap_or_else(|| format!("row {key}"));
+        match trajectory(&snapshot, path, &mut collections, key) {
+            Ok(Some((recorded_at_us, recording))) => {
+                visit(Sound::Trajectory { seq: key, recorded_at_us, recording: &recording })?;
+                found.count(Kind::Trajectory, Ok(()));
+            }
+            Ok(None) if known => {
+                found.count(Kind::Trajectory, Err((name(), damaged("trajectory", "its row is missing"))));
+            }
+            Err((id, error)) if known => found.count(Kind::Trajectory, Err((id.unwrap_or_else(name), error))),
+            Ok(None) | Err(_) => {}
+        }
+        Ok(())
+    })?;
+    Keys::new(&snapshot, "models", "rowid", &[], whole).try_for_each(|key, known| {
+        match models::by_row(&snapshot, path, key) {
+            Ok(Some((stored_at_us, model))) => {
+                visit(Sound::Model { stored_at_us, model: &model })?;
+                found.count(Kind::Model, Ok(()));
+            }
+            Ok(None) if known => {
+                found.count(Kind::Model, Err((format!("row {key}"), damaged("model", "its row is missing"))));
+            }
+            Err(error) if known => found.count(Kind::Model, Err((format!("row {key}"), error))),
+            Ok(None) | Err(_) => {}
+        }
+        Ok(())
+    })?;
+    Keys::new(&snapshot, "fits", "seq", &["fits_by_env"], whole).try_for_each(|key, known| {
+        match fits::by_row(&snapshot, path, key) {
+            Ok(Some(_)) => {
+                visit(Sound::Fit { row: key })?;
+                found.count(Kind::Fit, Ok(()));
+            }
+            Ok(None) if known => {
+                found.count(Kind::Fit, Err((format!("row {key}"), damaged("fit", "its row is missing"))));
+            }
+            Err(error) if known => found.count(Kind::Fit, Err((format!("row {key}"), error))),
+            Ok(None) | Err(_) => {}
+        }
+        Ok(())
+    })?;
+    Ok(found)
+}
+
+fn damaged(what: &str, message: impl Into<String>) -> StoreError {
+    StoreError::Corrupt { what: what.into(), message: message.into() }
+}
+
+/// The keys of a table.
+struct Keys {
+    /// What the table or an index tells, rising.
+    known: Vec<i64>,
+    /// Where there may be more: within this range.
+    guessed: Option<(i64, i64)>,
+}
+
+impl Keys {
+    /// Where the structure is whole, the table tells; else whatever reads of the table and its indices, from either end.
+    fn new(connection: &Connection, table: &str, key: &str, indices: &[&str], whole: bool) -> Self {
+        let mut known = Vec::new();
+        let mut read = |sql: &str| {
+            let Ok(mut statement) = connection.prepare(sql) else { return };
+            let Ok(mut rows) = statement.query([]) else { return };
+            while let Ok(Some(row)) = rows.next() {
+                known.extend(row.get::<_, i64>(0).ok());
+            }
+        };
+        read(&format!("SELECT {key} FROM {table} NOT INDEXED ORDER BY {key}"));
+        if whole {
+            return Self { known, guessed: None };
+        }
+        read(&format!("SELECT {key} FROM {table} NOT INDEXED ORDER BY {key} DESC"));
+        let own = format!("sqlite_autoindex_{table}_1");
+        for index in indices.iter().copied().chain([own.as_str()]) {
+            read(&format!("SELECT {key} FROM {table} INDEXED BY {index}"));
+        }
+        known.sort_unstable();
+        known.dedup();
+        // Pages before and after what is known may be such as no index tells of.
+        let range = known.first().zip(known.last()).map(|(&first, &last)| (first.min(1), last.saturating_add(BEYOND)));
+        Self { known, guessed: range.filter(|(first, last)| last.saturating_sub(*first) <= MAX_GUESSED) }
+    }
+
+    /// Every key, rising, and whether it is known.
+    fn try_for_each(self, mut visit: impl FnMut(i64, bool) -> Result<(), StoreError>) -> Result<(), StoreError> {
+        match self.guessed {
+            None => self.known.into_iter().try_for_each(|key| visit(key, true)),
+            Some((first, last)) => {
+                (first..=last).try_for_each(|key| visit(key, self.known.binary_search(&key).is_ok()))
+            }
+        }
+    }
+}
+
+/// Ids of trajectories by row, as far as the index of the ids reads.
+fn names(connection: &Connection) -> HashMap<i64, String> {
+    let mut names = HashMap::new();
+    let sql = "SELECT seq, trajectory_id FROM trajectories INDEXED BY sqlite_autoindex_trajectories_1";
+    let Ok(mut statement) = connection.prepare(sql) else { return names };
+    let Ok(mut rows) = statement.query([]) else { return names };
+    while let Ok(Some(row)) = rows.next() {
+        if let (Ok(seq), Ok(id)) = (row.get(0), row.get(1)) {
+            names.insert(seq, id);
+        }
+    }
+    names
+}
+
+/// Reads a trajectory and when it was recorded, and checks it against what it was stored with. An error comes with its id where that reads.
+fn trajectory(
+    connection: &Connection,
+    path: &Path,
+    collections: &mut HashMap<i64, Collection>,
+    seq: i64,
+) -> Result<Option<(i64, Recording)>, (Option<String>, StoreError)> {
+    let mut id = None;
+    let read = (|| {
+        let sql = "SELECT trajectory_id, collection, recorded_at, seed, steps, final_state, terminated, truncated, \
+                   content_hash, states, actions, rewards FROM trajectories WHERE seq = ?";
+        let mut statement = connection.prepare_cached(sql)?;
+        let mut rows = statement.query([seq])?;
+        let Some(row) = rows.next()? else { return Ok(None) };
+        let text = row.get::<_, String>(0)?;
+        id = Some(text.clone());
+        let collection_row: i64 = row.get(1)?;
+        let collection = if let Some(collection) = collections.get(&collection_row) {
+            collection.clone()
+        } else {
+            let collection = trajectories::collection(connection, collection_row)?;
+            collections.insert(collection_row, collection.clone());
+            collection
+        };
+        let blob = |column| row.get::<_, Vec<u8>>(column).map(Bytes::from);
+        let arrays = Arrays {
+            final_state: row.get(5)?,
+            terminated: row.get(6)?,
+            truncated: row.get(7)?,
+            states: blob(9)?,
+            actions: blob(10)?,
+            rewards: blob(11)?,
+        };
+        let seed = row.get::<_, Option<i64>>(3)?.map(|bits| bits as u64);
+        let (recorded_at_us, steps, hash): (i64, i64, Vec<u8>) = (row.get(2)?, row.get(4)?, row.get(8)?);
+        Ok(Some((text, collection, seed, arrays, recorded_at_us, steps, hash)))
+    })();
+    let read = read.map_err(|error: rusqlite::Error| (id.clone(), StoreError::from_sqlite(path, &error)))?;
+    let Some((text, collection, seed, arrays, recorded_at_us, steps, hash)) = read else { return Ok(None) };
+    let checked = stored_uuid(&text).and_then(|id| {
+        let recording = Recording::new(id, collection, seed, arrays);
+        let recording = recording.map_err(|error| damaged("trajectory", error.to_string()))?;
+        if recording.content_hash()[..] != hash[..] || i64::from(recording.steps()) != steps {
+            return Err(damaged("trajectory", "its content is not what was stored: the hashes differ"));
+        }
+        Ok(recording)
+    });
+    match checked {
+        Ok(recording) => Ok(Some((recorded_at_us, recording))),
+        Err(error) => Err((Some(text), error)),
+    }
+}

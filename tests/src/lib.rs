@@ -1,6 +1,8 @@
 //! What Mazeway's end-to-end tests share: real servers on free ports of the loopback interface, shut down on drop.
 
+pub mod crash;
 pub mod faces;
+pub mod fuzz;
 pub mod learner;
 pub mod programs;
 pub mod proxy;

@@ -16,7 +16,7 @@ use std::{
 };
 use tokio::sync::mpsc;
 
-/// Kills of one test.
+/// Kills of one test, unless `MAZEWAY_KILLS` says how many.
 const ROUNDS: u128 = 6;
 /// Clients that record at the same time.
 const CLIENTS: u128 = 4;
@@ -53,9 +53,10 @@ async fn record_until_death(address: String, first: u128, acknowledged: Arc<Atom
 
 #[tokio::test(flavor = "multi_thread")]
 async fn what_was_acknowledged_survives_kills() {
+    let rounds = std::env::var("MAZEWAY_KILLS").map_or(ROUNDS, |rounds| rounds.parse().expect("a number"));
     let data = tempfile::tempdir().expect("a directory");
     let mut safe: Vec<u128> = Vec::new();
-    for round in 0..ROUNDS {
+    for round in 0..rounds {
         let service = Service::learner(data.path());
         let learner = Learner::connect(service.address()).await.expect("a learner that opens what was killed");
         let stored = export(&learner, &pb::TrajectoryFilter::default()).await;
@@ -72,7 +73,7 @@ async fn what_was_acknowledged_survives_kills() {
         });
         let clients = clients.collect::<Vec<_>>();
         // In the middle: every round a little later, and never before something was acknowledged.
-        let enough = 50 + round as u64 * 150;
+        let enough = 50 + (round % ROUNDS) as u64 * 150;
         while count.load(Ordering::Relaxed) < enough {
             tokio::time::sleep(Duration::from_millis(1)).await;
         }
@@ -87,11 +88,21 @@ async fn what_was_acknowledged_survives_kills() {
     let ids = stored.iter().map(|t| t.trajectory_id.as_str()).collect::<std::collections::HashSet<_>>();
     assert_eq!(ids.len(), stored.len(), "no trajectory is stored twice");
     let stored = stored.iter().map(|t| (t.trajectory_id.clone(), t)).collect::<HashMap<_, _>>();
-    assert!(safe.len() as u128 >= ROUNDS * 50);
-    for number in safe {
+    assert!(safe.len() as u128 >= rounds * 50);
+    for &number in &safe {
         let expected = trajectory(number);
         assert_eq!(stored.get(&expected.trajectory_id).copied(), Some(&expected));
     }
+    println!(
+        "{rounds} kills under {CLIENTS} clients: {} trajectories acknowledged, {} of them found, {} found beside them",
+        safe.len(),
+        safe.len(),
+        stored.len() - safe.len()
+    );
+    drop(learner);
+    service.kill();
+    let found = mazeway_learner::store::verify(data.path()).expect("findings");
+    assert!(found.is_sound() && found.trajectories.sound == stored.len() as u64, "{found:?}");
 }
 
 #[tokio::test(flavor = "multi_thread")]

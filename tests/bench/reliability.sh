@@ -1,0 +1,22 @@
+#!/usr/bin/env bash
+# The long runs behind docs/RELIABILITY.md: tests/bench/reliability.sh cuts|kills|damage|fuzz [N]
+#   cuts N     cuts of the power (default 1000000)
+#   kills N    kill -9 of the service under a recording load (default 200)
+#   damage N   damaged files (default 10000)
+#   fuzz N     inputs of every target (default 10000000); SEED and TARGETS choose, KEEP=DIR keeps what led to new answers
+set -euo pipefail
+cd "$(dirname "$0")/../.."
+test() { cargo test --release --locked -p mazeway-tests --test "$1" "$2" -- --nocapture; }
+case "${1:-}" in
+    cuts) MAZEWAY_CUTS=${2:-1000000} test crash what_was_acknowledged ;;
+    kills) MAZEWAY_KILLS=${2:-200} test kill what_was_acknowledged ;;
+    damage) MAZEWAY_DAMAGES=${2:-10000} test damage whatever_page ;;
+    fuzz)
+        # shellcheck disable=SC2086
+        cargo run --release --locked -p mazeway-tests --example fuzz -- "${2:-10000000}" "${SEED:-1}" ${TARGETS:-}
+        ;;
+    *)
+        sed -n '2,6s/^# //p' "$0" >&2
+        exit 2
+        ;;
+esac

@@ -1,0 +1,257 @@
+//! Does a history to a store, cuts the power at random moments, and compares what is left with what was promised.
+
+use super::{
+    disk::{Disk, Image, below},
+    history::{Contents, Step, extra, steps},
+    subject::{Segment, Subject},
+    vfs::{self, mount, unmount},
+};
+use mazeway_learner::store::{FILE_NAME, Filter, Recording, Store, StoreError, StoreOptions};
+use mazeway_proto::learner as pb;
+use proptest::{
+    prelude::*,
+    test_runner::{Config, RngAlgorithm, TestCaseError, TestRng, TestRunner},
+};
+use rand_pcg::Pcg64Mcg;
+use std::{
+    path::{Path, PathBuf},
+    rc::Rc,
+};
+use tempfile::TempDir;
+use tokio::runtime::Runtime;
+
+/// Cuts of the power in one generation of a history.
+const CUTS: usize = 24;
+/// Pages after which a log is written back: few, so that it happens often.
+const CHECKPOINT_PAGES: u32 = 12;
+
+/// What was tried and found.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Tally {
+    /// Things done to stores.
+    pub steps: u64,
+    /// Steps that the disk made fail.
+    pub failed_steps: u64,
+    /// Cuts of the power, each at another moment or with another luck, opened and compared.
+    pub cuts: u64,
+    /// Trajectories that had been acknowledged before a cut and were looked for after it.
+    pub acknowledged: u64,
+    /// Cuts in the middle of a request.
+    pub cuts_within: u64,
+    /// Of these, how many left the request there as a whole.
+    pub kept_within: u64,
+}
+
+impl std::ops::AddAssign for Tally {
+    fn add_assign(&mut self, other: Self) {
+        self.steps += other.steps;
+        self.failed_steps += other.failed_steps;
+        self.cuts += other.cuts;
+        self.acknowledged += other.acknowledged;
+        self.cuts_within += other.cuts_within;
+        self.kept_within += other.kept_within;
+    }
+}
+
+/// Draws histories from a seed until the power was cut so many times. `old` is a store of the first release, with which some
+/// begin. A disk that `lies` answers to a sync without doing it.
+///
+/// # Errors
+/// Something that was acknowledged is not there, something is there in part, or a store does not open.
+pub fn run(seed: u64, cuts: u64, old: &[u8], lies: bool) -> Result<Tally, String> {
+    let mut bytes = [0; 32];
+    bytes[..8].copy_from_slice(&seed.to_le_bytes());
+    // Each history has one generation at least.
+    let cases = (cuts / CUTS as u64 + 1) as u32;
+    let config =
+        Config { cases, failure_persistence: None, max_shrink_iters: if lies { 0 } else { 300 }, ..Config::default() };
+    let mut runner = TestRunner::new_with_rng(config, TestRng::from_seed(RngAlgorithm::ChaCha, &bytes));
+    let bench = Bench::new(lies);
+    let tally = std::cell::Cell::new(Tally::default());
+    let histories = (any::<u64>(), any::<u8>(), prop::collection::vec(steps(), 1..4));
+    let outcome = runner.run(&histories, |(luck, start, generations)| {
+        let mut sum = tally.get();
+        if sum.cuts < cuts {
+            let old = [(FILE_NAME.to_owned(), old.to_vec())];
+            let base = if start.is_multiple_of(8) { Image::from(old) } else { Image::new() };
+            sum += bench.history(base, &generations, luck)?;
+            tally.set(sum);
+        }
+        Ok(())
+    });
+    outcome.map(|()| tally.get()).map_err(|error| format!("seed {seed}: {error}"))
+}
+
+/// Where stores are opened: directories that exist, whose files lie on disks of ours.
+pub(super) struct Bench {
+    pub(super) runtime: Runtime,
+    _root: TempDir,
+    pub(super) at_work: PathBuf,
+    after: PathBuf,
+    lies: bool,
+}
+
+impl Bench {
+    fn new(lies: bool) -> Self {
+        let root = tempfile::tempdir().expect("a directory");
+        let [at_work, after] = ["work", "after"].map(|name| root.path().join(name));
+        for directory in [&at_work, &after] {
+            std::fs::create_dir(directory).expect("a directory");
+        }
+        let runtime = tokio::runtime::Builder::new_current_thread().build().expect("a runtime");
+        Self { runtime, _root: root, at_work, after, lies }
+    }
+
+    pub(super) fn open(directory: &Path) -> Result<Store, StoreError> {
+        let options = StoreOptions {
+            checkpoint_pages: Some(CHECKPOINT_PAGES),
+            vfs: Some(vfs::NAME.into()),
+            ..StoreOptions::default()
+        };
+        Store::open_with(directory, options)
+    }
+
+    /// Generations of a store: each begins with what a cut has left of the one before.
+    fn history(&self, base: Image, generations: &[Vec<Step>], luck: u64) -> Result<Tally, TestCaseError> {
+        let mut rng = Pcg64Mcg::new(u128::from(luck));
+        let mut tally = Tally::default();
+        let mut image = base;
+        let mut contents = Rc::new(self.pristine(&image)?);
+        for steps in generations {
+            let (disk, segments, done) = self.generation(&image, contents, steps)?;
+            tally += done;
+            let mut survivors = None;
+            for _ in 0..CUTS {
+                let moment = below(&mut rng, disk.now() + 1);
+                image = disk.cut(moment, &mut rng);
+                let segment = &segments[segments.partition_point(|segment| segment.from <= moment) - 1];
+                let found = self.survivors(&image, &segment.allowed, &mut rng)?;
+                tally.cuts += 1;
+                tally.acknowledged += segment.allowed[0].recordings.len() as u64;
+                if segment.allowed.len() > 1 {
+                    tally.cuts_within += 1;
+                    tally.kept_within += u64::from(found != segment.allowed[0]);
+                }
+                survivors = Some(found);
+            }
+            contents = survivors.expect("a cut");
+        }
+        Ok(tally)
+    }
+
+    /// What an image holds that no power was cut on.
+    fn pristine(&self, image: &Image) -> Result<Contents, TestCaseError> {
+        mount(&self.after, Disk::new(image));
+        let contents = read(&expect(Self::open(&self.after))?)?;
+        unmount(&self.after);
+        Ok(contents)
+    }
+
+    /// Does the steps, and tells what the disk has seen and what had to be there when.
+    fn generation(
+        &self,
+        image: &Image,
+        contents: Rc<Contents>,
+        steps: &[Step],
+    ) -> Result<(Disk, Vec<Segment>, Tally), TestCaseError> {
+        let mut disk = Disk::new(image);
+        if self.lies {
+            disk.lie();
+        }
+        mount(&self.at_work, disk);
+        let mut subject = Subject::open(self, contents)?;
+        for step in steps {
+            subject.step(step)?;
+        }
+        let (segments, tally) = subject.close();
+        Ok((unmount(&self.at_work), segments, tally))
+    }
+
+    /// Opens what a cut has left: it must open, hold one of the allowed contents, and go on.
+    fn survivors(
+        &self,
+        image: &Image,
+        allowed: &[Rc<Contents>],
+        rng: &mut Pcg64Mcg,
+    ) -> Result<Rc<Contents>, TestCaseError> {
+        mount(&self.after, Disk::new(image));
+        let store = expect(Self::open(&self.after))?;
+        let contents = read(&store)?;
+        let Some(found) = allowed.iter().find(|allowed| ***allowed == contents).cloned() else {
+            return Err(TestCaseError::fail(format!(
+                "after a cut the store holds {}, allowed were {}",
+                describe(&contents),
+                allowed.iter().map(|allowed| describe(allowed)).collect::<Vec<_>>().join(" or ")
+            )));
+        };
+        let dice = rng.next_u32();
+        let mut after = vec![Rc::clone(&found)];
+        if dice.is_multiple_of(8) {
+            let integrity = expect(store.check_structure())?;
+            prop_assert!(integrity.is_empty(), "{:?}", integrity);
+        }
+        if dice.is_multiple_of(4) {
+            let more = extra();
+            let mut contents = Contents::clone(&found);
+            contents.record(std::slice::from_ref(&more));
+            prop_assert_eq!(expect(self.runtime.block_on(store.record(vec![more])))?, 1);
+            prop_assert_eq!(&read(&store)?, &contents);
+            after.push(Rc::new(contents));
+        }
+        drop(store);
+        let disk = unmount(&self.after);
+        // Cut again while it recovers, goes on or closes.
+        if dice.is_multiple_of(5) {
+            mount(&self.after, Disk::new(&disk.cut(below(rng, disk.now() + 1), rng)));
+            let contents = read(&expect(Self::open(&self.after))?)?;
+            unmount(&self.after);
+            prop_assert!(after.iter().any(|after| **after == contents), "{}", describe(&contents));
+        }
+        Ok(found)
+    }
+}
+
+/// An error may be the disk's alone.
+pub(super) fn check_disk(error: &StoreError) -> Result<(), TestCaseError> {
+    match error {
+        StoreError::DiskFull { .. } | StoreError::Database { .. } => Ok(()),
+        other => Err(TestCaseError::fail(format!("expected an error of the disk, got: {other}"))),
+    }
+}
+
+pub(super) fn expect<T>(result: Result<T, StoreError>) -> Result<T, TestCaseError> {
+    result.map_err(|error| TestCaseError::fail(error.to_string()))
+}
+
+/// Everything that a filter selects.
+pub(super) fn recordings(store: &Store, filter: &Filter) -> Result<Vec<Recording>, StoreError> {
+    let mut all = Vec::new();
+    let mut cursor = store.cursor(filter)?;
+    loop {
+        let page = store.next_page(&mut cursor)?;
+        if page.is_empty() {
+            return Ok(all);
+        }
+        all.extend(page);
+    }
+}
+
+/// Everything that a store shows.
+pub(super) fn read(store: &Store) -> Result<Contents, TestCaseError> {
+    let mut contents = Contents { recordings: expect(recordings(store, &Filter::default()))?, ..Contents::default() };
+    for info in expect(store.models(""))? {
+        let id = info.header.model_id;
+        let model = expect(store.model(&id))?.ok_or_else(|| TestCaseError::fail("a model that is listed"))?;
+        contents.models.insert(id, model);
+    }
+    for info in expect(store.fits("", "", i64::MAX, u32::MAX))? {
+        let fit = expect(store.fit(&info.fit_id))?.ok_or_else(|| TestCaseError::fail("a fit that is listed"))?;
+        contents.fits.insert(info.fit_id, pb::Fit { created_at: None, ..fit });
+    }
+    Ok(contents)
+}
+
+pub(super) fn describe(contents: &Contents) -> String {
+    let ids = contents.recordings.iter().map(|r| (r.id().to_string()[..4].to_owned(), r.steps())).collect::<Vec<_>>();
+    format!("{ids:?} with {} models and {} fits", contents.models.len(), contents.fits.len())
+}

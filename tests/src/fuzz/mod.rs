@@ -1,0 +1,139 @@
+//! Bytes from outside, mutated: whatever they are, what reads them ends in a value or in an error that says why.
+//!
+//! No sanitizer and no nightly compiler: inputs are mutated from a corpus that is kept in the repository, and an input that
+//! leads to an answer not seen before (a message with its numbers and names taken out) joins the corpus of the run. A panic
+//! is caught with its input, memory is metered by the caller, a hang is an execution that takes longer than [`SLOW`].
+
+pub mod mutate;
+pub mod targets;
+
+use mutate::{Mutator, below};
+use rand_pcg::Pcg64Mcg;
+use std::{
+    collections::HashSet,
+    fs,
+    panic::{AssertUnwindSafe, catch_unwind},
+    path::{Path, PathBuf},
+    time::{Duration, Instant},
+};
+use targets::Target;
+
+/// Bytes that one execution may hold at its peak.
+pub const MAX_BYTES: u64 = 256 << 20;
+/// Time that one execution may take, on a machine that is busy.
+pub const SLOW: Duration = Duration::from_secs(20);
+
+/// What a run did.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Tally {
+    /// Inputs that were read.
+    pub executions: u64,
+    /// Of these, how many were accepted.
+    pub accepted: u64,
+    /// Different answers.
+    pub answers: usize,
+    /// Bytes that an execution held at most.
+    pub peak_bytes: u64,
+    /// Seconds that an execution took at most.
+    pub longest_secs: f64,
+}
+
+/// Where the inputs of a target are kept.
+pub fn corpus_directory(target: &Target) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("data").join("fuzz").join(target.name)
+}
+
+/// The inputs that are kept, in the order of their names.
+///
+/// # Panics
+/// They do not read.
+pub fn corpus(target: &Target) -> Vec<Vec<u8>> {
+    let mut inputs = (target.seeds)();
+    if let Ok(files) = fs::read_dir(corpus_directory(target)) {
+        let mut files = files.map(|file| file.expect("a file").path()).collect::<Vec<_>>();
+        files.sort();
+        inputs.extend(files.iter().map(|file| fs::read(file).expect("an input")));
+    }
+    assert!(!inputs.is_empty(), "{}: no inputs", target.name);
+    inputs
+}
+
+/// Reads mutated inputs. `meter` calls what it is given and tells how many bytes were held at its peak. Inputs that led to
+/// new answers are given to `keep`.
+///
+/// # Panics
+/// An execution panics, takes too long or too much memory; the input is written to the temporary directory.
+pub fn run(
+    target: &Target,
+    executions: u64,
+    seed: u64,
+    mut meter: impl FnMut(&mut dyn FnMut()) -> u64,
+    mut keep: impl FnMut(&[u8], &str),
+) -> Tally {
+    let mut mutator = Mutator::new(Pcg64Mcg::new(u128::from(seed)), target.words);
+    let mut pool = corpus(target);
+    let kept = pool.len();
+    let mut seen = HashSet::new();
+    let mut tally = Tally::default();
+    for execution in 0..executions {
+        let input = match usize::try_from(execution) {
+            Ok(first) if first < kept => pool[first].clone(),
+            _ => mutator.mutate(&pool, target.max_bytes),
+        };
+        let begun = Instant::now();
+        let mut answer = None;
+        let peak = meter(&mut || {
+            answer = Some(catch_unwind(AssertUnwindSafe(|| (target.read)(&input))));
+        });
+        let took = begun.elapsed();
+        let failure = match &answer {
+            Some(Ok(_)) if peak > MAX_BYTES => Some(format!("held {peak} bytes")),
+            Some(Ok(_)) if took > SLOW => Some(format!("took {took:?}")),
+            Some(Ok(_)) => None,
+            Some(Err(_)) | None => Some("panicked".to_owned()),
+        };
+        if let Some(failure) = failure {
+            let file = std::env::temp_dir().join(format!("{}-{seed}-{execution}", target.name));
+            fs::write(&file, &input).expect("a file for the input");
+            panic!("{}: execution {execution} of seed {seed} {failure}; its input is {}", target.name, file.display());
+        }
+        tally.executions += 1;
+        tally.peak_bytes = tally.peak_bytes.max(peak);
+        tally.longest_secs = tally.longest_secs.max(took.as_secs_f64());
+        let Some(Ok(answer)) = answer else { continue };
+        tally.accepted += u64::from(answer.is_ok());
+        let shape = shape(&answer);
+        if seen.insert(shape.clone()) && execution >= kept as u64 {
+            keep(&input, &shape);
+            pool.push(input);
+        } else if answer.is_ok() && execution.is_multiple_of(64) && pool.len() < 4 * kept + 256 {
+            // What is accepted goes deeper than what is refused.
+            pool.push(input);
+        } else if pool.len() > kept + 64 && execution.is_multiple_of(4096) {
+            let i = kept + below(mutator.rng(), pool.len() - kept);
+            pool.swap_remove(i);
+        }
+    }
+    tally.answers = seen.len();
+    tally
+}
+
+/// An answer without the numbers and the quoted names in it.
+fn shape(answer: &Result<String, String>) -> String {
+    let (kind, text) = match answer {
+        Ok(text) => ("ok: ", text),
+        Err(text) => ("error: ", text),
+    };
+    let mut shape = kind.to_owned();
+    let mut quoted = false;
+    for c in text.chars().take(300) {
+        match c {
+            '"' | '\'' | '`' => quoted = !quoted,
+            _ if quoted => {}
+            '0'..='9' if shape.ends_with('#') => {}
+            '0'..='9' => shape.push('#'),
+            c => shape.push(c),
+        }
+    }
+    shape
+}

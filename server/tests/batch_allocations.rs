@@ -38,3 +38,24 @@ fn steps_and_resets_do_not_allocate() {
         }
     }
 }
+
+#[test]
+fn several_cores_take_a_few_allocations_a_step_and_none_an_environment() {
+    const ENVS: usize = 40_000;
+    let environment = Registry::new().configure("Maze-v0", &serde_json::Map::new()).expect("an environment");
+    let options =
+        BatchOptions { num_envs: ENVS, autoreset: Autoreset::NextStep, max_episode_steps: 7, action_masks: true };
+    let mut batch = environment.batch(options);
+    let actions = vec![0; ENVS * 4];
+    batch.reset(Seeds::From(1), None).expect("resets");
+    // What a pool makes when it is first used.
+    batch.step(&actions).expect("steps");
+    let measured = allocation_counter::measure(|| {
+        for _ in 0..100 {
+            batch.step(&actions).expect("steps");
+        }
+    });
+    // On this thread: a job for each other core, and what the pool queues them in.
+    let cores = std::thread::available_parallelism().map_or(1, usize::from) as u64;
+    assert!(measured.count_total <= 100 * 4 * cores, "{} allocations", measured.count_total);
+}

@@ -37,7 +37,7 @@ macro_rules! element {
     )*};
 }
 
-element!(u8, i32, u32, i64, u64, f32, f64);
+element!(u8, u16, i32, u32, i64, u64, f32, f64);
 
 /// A view of a packed array.
 #[derive(Clone, PartialEq, Eq)]

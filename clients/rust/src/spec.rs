@@ -40,7 +40,10 @@ impl DType {
             Ok(pb::DType::Int64) => Ok(Self::Int64),
             Ok(pb::DType::Float32) => Ok(Self::Float32),
             Ok(pb::DType::Float64) => Ok(Self::Float64),
-            Ok(pb::DType::Unspecified) | Err(_) => Err(ClientError::protocol(format!("unknown element type {dtype}"))),
+            // Two bytes are for roll-outs alone.
+            Ok(pb::DType::Unspecified | pb::DType::Uint16) | Err(_) => {
+                Err(ClientError::protocol(format!("unknown element type {dtype}")))
+            }
         }
     }
 }

@@ -4,7 +4,7 @@
 //! reply by copying one prefix of the block.
 
 use super::{Autoreset, BatchOptions};
-use crate::sim::{DType, EnvSpec, InfoColumn};
+use crate::sim::{DType, EnvSpec, InfoColumn, Simulator};
 use std::ops::Range;
 
 /// Name of the info column that a session may ask for beside the environment's own.
@@ -157,9 +157,148 @@ impl StepBuffers {
         if self.has_final { &self.bytes[self.layout.final_infos[column].clone()] } else { &[] }
     }
 
-    #[inline]
-    pub(super) fn row(&mut self, range: Range<usize>, index: usize) -> &mut [u8] {
-        let len = range.len() / self.layout.num_envs;
-        &mut self.bytes[range.start + index * len..][..len]
+    /// The whole block, an array apart from the other.
+    pub(super) fn parts(&mut self) -> Parts<'_> {
+        let Self { bytes, layout, .. } = self;
+        let mut rest: &mut [u8] = bytes;
+        // The parts follow one another in this order.
+        let mut take = |range: &Range<usize>| rest.split_off_mut(..range.len()).expect("the block holds its layout");
+        let observations = take(&layout.observations);
+        let (rewards, terminated, truncated) =
+            (take(&layout.rewards), take(&layout.terminated), take(&layout.truncated));
+        let infos = Columns::new(&layout.infos, &mut take);
+        // Where there is a mask, it is the last column.
+        let mask_len = layout.infos.last().map_or(0, Range::len) / layout.num_envs;
+        let observation_len = layout.observations.len() / layout.num_envs;
+        let present = Rows { observations, observation_len, infos, mask_len };
+        let last = Rows {
+            observations: take(&layout.final_observations),
+            observation_len: layout.final_observations.len() / layout.num_envs,
+            infos: Columns::new(&layout.final_infos, &mut take),
+            mask_len,
+        };
+        Parts { present, rewards: rewards.as_chunks_mut().0, terminated, truncated, last }
+    }
+}
+
+/// Most info columns of an environment, the action mask included: so many need no list on the heap.
+pub const MAX_COLUMNS: usize = 8;
+
+/// Info columns of some environments.
+pub(super) struct Columns<'a> {
+    bytes: [&'a mut [u8]; MAX_COLUMNS],
+    len: usize,
+}
+
+impl<'a> Columns<'a> {
+    fn new(ranges: &[Range<usize>], take: &mut impl FnMut(&Range<usize>) -> &'a mut [u8]) -> Self {
+        let mut columns = Self { bytes: Default::default(), len: ranges.len() };
+        columns.bytes.iter_mut().zip(ranges).for_each(|(column, range)| *column = take(range));
+        columns
+    }
+
+    /// The rows of the first `len` of `num_envs` environments and the others.
+    fn split(self, len: usize, num_envs: usize) -> (Self, Self) {
+        let (mut first, mut second) =
+            (Self { bytes: Default::default(), ..self }, Self { bytes: Default::default(), ..self });
+        for (at, column) in self.bytes.into_iter().enumerate().take(self.len) {
+            let row_len = column.len() / num_envs;
+            (first.bytes[at], second.bytes[at]) = column.split_at_mut(len * row_len);
+        }
+        (first, second)
+    }
+}
+
+/// Observations and infos of some environments.
+pub(super) struct Rows<'a> {
+    observations: &'a mut [u8],
+    observation_len: usize,
+    infos: Columns<'a>,
+    /// Bytes of an action mask, where there is one.
+    mask_len: usize,
+}
+
+impl Rows<'_> {
+    /// Those of the first `len` of `num_envs` environments and of the others.
+    fn split(self, len: usize, num_envs: usize) -> (Self, Self) {
+        let (infos, infos_after) = self.infos.split(len, num_envs);
+        let (observations, observations_after) = self.observations.split_at_mut(len * self.observation_len);
+        let (observation_len, mask_len) = (self.observation_len, self.mask_len);
+        (
+            Self { observations, observation_len, infos, mask_len },
+            Self { observations: observations_after, observation_len, infos: infos_after, mask_len },
+        )
+    }
+
+    /// Packs what neighbouring environments show, from row `first` on. `info_lens` are the spec's columns; one more is the
+    /// action mask.
+    pub fn write<S: Simulator>(
+        &mut self,
+        scratch: &mut S,
+        states: &mut [S::Stored],
+        first: usize,
+        info_lens: &[usize],
+    ) {
+        let (own, mask) = self.infos.bytes[..self.infos.len].split_at_mut(info_lens.len());
+        S::write_rows(scratch, states, first, self.observations, self.observation_len, own, info_lens);
+        if let [mask] = mask {
+            for (i, stored) in states.iter_mut().enumerate() {
+                let row = (first + i) * self.mask_len..(first + i + 1) * self.mask_len;
+                S::load(scratch, stored).write_action_mask(&mut mask[row]);
+            }
+        }
+    }
+
+    /// Packs what one environment shows as row `index`.
+    #[cold]
+    pub fn write_one<S: Simulator>(&mut self, simulator: &S, index: usize, info_lens: &[usize]) {
+        let row = |len: usize| index * len..(index + 1) * len;
+        simulator.write_observation(&mut self.observations[row(self.observation_len)]);
+        let (own, mask) = self.infos.bytes[..self.infos.len].split_at_mut(info_lens.len());
+        for (column, (out, &len)) in own.iter_mut().zip(info_lens).enumerate() {
+            simulator.write_info(column, &mut out[row(len)]);
+        }
+        if let [mask] = mask {
+            simulator.write_action_mask(&mut mask[row(self.mask_len)]);
+        }
+    }
+}
+
+/// A reply of some environments, an array apart from the other.
+pub(super) struct Parts<'a> {
+    pub present: Rows<'a>,
+    pub rewards: &'a mut [[u8; 8]],
+    pub terminated: &'a mut [u8],
+    pub truncated: &'a mut [u8],
+    /// Empty unless `SAME_STEP`.
+    pub last: Rows<'a>,
+}
+
+impl Parts<'_> {
+    /// No reward and no flag.
+    pub fn clear_outcomes(&mut self) {
+        self.rewards.fill([0; 8]);
+        self.terminated.fill(0);
+        self.truncated.fill(0);
+    }
+
+    /// Those of the first `len` environments and of the others.
+    pub fn split(self, len: usize) -> (Self, Self) {
+        let num_envs = self.terminated.len();
+        let (present, present_after) = self.present.split(len, num_envs);
+        let (last, last_after) = self.last.split(len, num_envs);
+        let (rewards, rewards_after) = self.rewards.split_at_mut(len);
+        let (terminated, terminated_after) = self.terminated.split_at_mut(len);
+        let (truncated, truncated_after) = self.truncated.split_at_mut(len);
+        (
+            Self { present, rewards, terminated, truncated, last },
+            Self {
+                present: present_after,
+                rewards: rewards_after,
+                terminated: terminated_after,
+                truncated: truncated_after,
+                last: last_after,
+            },
+        )
     }
 }

@@ -1,19 +1,20 @@
 //! Batches: n environments of one kind that are reset and stepped together, with Gymnasium 1.x semantics.
 //!
 //! Invariants: environment i of a batch seeded with s behaves exactly like a single one seeded with s + i; a call that is
-//! refused changes nothing; a step allocates nothing and takes no lock. Deliberately absent: transports, leases,
-//! parallelism.
+//! refused changes nothing; a step allocates nothing and takes no lock, but where a batch is so large that several cores
+//! share it: then it is a few of each for the whole batch. What comes of a step never depends on the number of cores.
+//! Deliberately absent: transports, leases.
 
+mod block;
 mod buffers;
 mod error;
+mod parallel;
 
+use block::{Block, Clock, Rules, Work};
 pub use buffers::{ACTION_MASK, Layout, StepBuffers};
 pub use error::BatchError;
 
-use crate::sim::{
-    Configured, DType, EnvSpec, InfoColumn, Rng, Simulator,
-    rng::{Purpose, stream},
-};
+use crate::sim::{Configured, DType, EnvSpec, InfoColumn, Rng, Simulator};
 use std::sync::Arc;
 
 /// What happens to an environment whose episode has ended (Gymnasium 1.x, `AutoresetMode`).
@@ -89,31 +90,19 @@ pub trait Batch: Send {
     fn render_svg(&self, index: usize) -> Result<String, BatchError>;
 }
 
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Phase {
-    /// Never reset: there is no observation.
-    Unborn,
-    Running,
-    /// The episode is over and a reset is due.
-    Ended,
-}
-
-/// One environment of a batch.
-#[derive(Clone)]
-struct Slot<S> {
-    simulator: S,
-    /// `None` until it is first seeded.
-    rng: Option<Rng>,
-    elapsed_steps: u32,
-    phase: Phase,
-}
-
-/// A batch of simulators of one kind.
-pub struct SimBatch<S> {
+/// A batch of simulators of one kind, what they are made of apart in arrays.
+pub struct SimBatch<S: Simulator> {
     spec: Arc<EnvSpec>,
     columns: Vec<InfoColumn>,
     options: BatchOptions,
-    slots: Vec<Slot<S>>,
+    /// Bytes of each info column of the spec.
+    info_lens: Vec<usize>,
+    /// What all environments share, and the place where one is put together.
+    scratch: S,
+    states: Vec<S::Stored>,
+    /// Without meaning until the first reset.
+    rngs: Vec<Rng>,
+    clocks: Vec<Clock>,
     buffers: StepBuffers,
     /// Set by the first reset, which covers every environment.
     born: bool,
@@ -124,96 +113,75 @@ impl<S: Simulator> SimBatch<S> {
     pub fn new(configured: &Configured<S>, options: BatchOptions) -> Self {
         let spec = Arc::clone(&configured.spec);
         let columns = buffers::info_columns(&spec, options.action_masks);
-        let slot = Slot { simulator: configured.prototype.clone(), rng: None, elapsed_steps: 0, phase: Phase::Unborn };
+        assert!(columns.len() <= buffers::MAX_COLUMNS, "an environment of at most {} columns", buffers::MAX_COLUMNS);
         let layout = Layout::new(&spec, &columns, options);
         Self {
+            info_lens: spec.info_columns.iter().map(InfoColumn::packed_len).collect(),
             spec,
             columns,
             options,
-            slots: vec![slot; options.num_envs],
+            scratch: configured.prototype.clone(),
+            states: vec![configured.prototype.stored(); options.num_envs],
+            rngs: vec![Rng::new(0, 0); options.num_envs],
+            clocks: vec![Clock::default(); options.num_envs],
             buffers: StepBuffers::new(layout),
             born: false,
         }
     }
 
-    fn slot(&self, index: usize) -> Result<&Slot<S>, BatchError> {
-        let slot = self.slots.get(index).ok_or(BatchError::IndexOutOfRange { index, num_envs: self.slots.len() })?;
-        if slot.phase == Phase::Unborn { Err(BatchError::NeverReset) } else { Ok(slot) }
+    /// Environment `index` as it stands.
+    fn environment(&self, index: usize) -> Result<S, BatchError> {
+        let num_envs = self.options.num_envs;
+        let mut stored = self.states.get(index).ok_or(BatchError::IndexOutOfRange { index, num_envs })?.clone();
+        if !self.born {
+            return Err(BatchError::NeverReset);
+        }
+        Ok(S::load(&mut self.scratch.clone(), &mut stored).clone())
     }
 
     fn check_mask(&self, mask: &[u8]) -> Result<(), BatchError> {
-        if mask.len() != self.slots.len() {
-            return Err(BatchError::MaskLength { num_envs: self.slots.len(), got: mask.len() });
+        let num_envs = self.options.num_envs;
+        if mask.len() != num_envs {
+            return Err(BatchError::MaskLength { num_envs, got: mask.len() });
         }
-        for (index, (&value, slot)) in mask.iter().zip(&self.slots).enumerate() {
+        for (index, &value) in mask.iter().enumerate() {
             if value > 1 {
                 return Err(BatchError::MaskValue { index, value });
             }
-            if value == 0 && slot.phase == Phase::Unborn {
+            if value == 0 && !self.born {
                 return Err(BatchError::MaskLeavesUnborn { index });
             }
         }
         Ok(())
     }
 
-    fn check_actions(&self, actions: &[u8]) -> Result<(), BatchError> {
+    fn check_actions<'a>(&self, actions: &'a [u8]) -> Result<&'a [[u8; 4]], BatchError> {
         if !self.born {
             return Err(BatchError::NeverReset);
         }
-        let expected = self.slots.len() * DType::Int32.size();
+        let num_envs = self.options.num_envs;
+        let expected = num_envs * DType::Int32.size();
         if actions.len() != expected {
-            return Err(BatchError::ActionsLength { expected, got: actions.len(), num_envs: self.slots.len() });
+            return Err(BatchError::ActionsLength { expected, got: actions.len(), num_envs });
         }
+        let (actions, n_actions) = (actions.as_chunks::<4>().0, self.spec.n_actions);
         let disabled = self.options.autoreset == Autoreset::Disabled;
-        for (index, (action, slot)) in unpack(actions).zip(&self.slots).enumerate() {
-            if slot.phase == Phase::Ended {
+        // As unsigned numbers negative actions are large: one comparison, many at a time.
+        let right = actions.iter().fold(true, |right, action| right & (u32::from_le_bytes(*action) < n_actions));
+        if right && !disabled {
+            return Ok(actions);
+        }
+        for (index, (action, clock)) in actions.iter().zip(&self.clocks).enumerate() {
+            if clock.ended() {
                 if disabled {
                     return Err(BatchError::EpisodeEnded { index });
                 }
-            } else if u32::try_from(action).is_ok_and(|action| action < self.spec.n_actions) {
-                // within the action space
-            } else {
-                return Err(BatchError::ActionOutOfRange { index, action, n_actions: self.spec.n_actions });
+                // Its action is ignored.
+            } else if u32::from_le_bytes(*action) >= n_actions {
+                return Err(BatchError::ActionOutOfRange { index, action: i32::from_le_bytes(*action), n_actions });
             }
         }
-        Ok(())
-    }
-
-    /// Packs the present observation and infos of one environment, into the final parts where `last`.
-    #[inline]
-    fn observe(&mut self, index: usize, last: bool) {
-        let Self { slots, buffers, spec, .. } = self;
-        let simulator = &slots[index].simulator;
-        let range = if last { &buffers.layout.final_observations } else { &buffers.layout.observations }.clone();
-        simulator.write_observation(buffers.row(range, index));
-        for column in 0..buffers.layout.infos.len() {
-            let range = if last { &buffers.layout.final_infos } else { &buffers.layout.infos }[column].clone();
-            let out = buffers.row(range, index);
-            if column < spec.info_columns.len() {
-                simulator.write_info(column, out);
-            } else {
-                simulator.write_action_mask(out);
-            }
-        }
-    }
-
-    #[inline]
-    fn begin_episode(&mut self, index: usize) {
-        let slot = &mut self.slots[index];
-        let rng = slot.rng.as_mut().expect("seeded by the first reset");
-        slot.simulator.reset(rng);
-        slot.elapsed_steps = 0;
-        slot.phase = Phase::Running;
-    }
-
-    #[inline]
-    fn set_outcome(&mut self, index: usize, reward: f64, terminated: bool, truncated: bool) {
-        let Layout { rewards, terminated: terminated_at, truncated: truncated_at, .. } = &self.buffers.layout;
-        let (reward_at, terminated_at, truncated_at) =
-            (rewards.start + index * 8, terminated_at.start + index, truncated_at.start + index);
-        self.buffers.bytes[reward_at..][..8].copy_from_slice(&reward.to_le_bytes());
-        self.buffers.bytes[terminated_at] = u8::from(terminated);
-        self.buffers.bytes[truncated_at] = u8::from(truncated);
+        Ok(actions)
     }
 
     fn clear_final(&mut self) {
@@ -224,30 +192,25 @@ impl<S: Simulator> SimBatch<S> {
         }
     }
 
-    #[inline]
-    fn step_one(&mut self, index: usize, action: u32) {
-        if self.slots[index].phase == Phase::Ended {
-            self.begin_episode(index);
-            self.set_outcome(index, 0.0, false, false);
-            self.observe(index, false);
-            return;
-        }
-        let slot = &mut self.slots[index];
-        let rng = slot.rng.as_mut().expect("seeded by the first reset");
-        let outcome = slot.simulator.step(action, rng);
-        slot.elapsed_steps += 1;
-        let truncated = self.options.max_episode_steps != 0 && slot.elapsed_steps >= self.options.max_episode_steps;
-        if outcome.terminated || truncated {
-            if self.options.autoreset == Autoreset::SameStep {
-                self.observe(index, true);
-                self.buffers.has_final = true;
-                self.begin_episode(index);
-            } else {
-                slot.phase = Phase::Ended;
-            }
-        }
-        self.set_outcome(index, outcome.reward, outcome.terminated, truncated);
-        self.observe(index, false);
+    /// Does checked work, on several cores where it is large enough for that to pay.
+    fn run(&mut self, work: Work<'_>) {
+        self.clear_final();
+        let BatchOptions { autoreset, max_episode_steps, num_envs, .. } = self.options;
+        let rules = Rules { autoreset, max_episode_steps, info_lens: &self.info_lens };
+        let whole = Block {
+            first: 0,
+            states: &mut self.states,
+            rngs: &mut self.rngs,
+            clocks: &mut self.clocks,
+            parts: self.buffers.parts(),
+        };
+        let block_envs = parallel::block_envs::<S>();
+        self.buffers.has_final = if num_envs < 2 * block_envs {
+            let mut whole = whole;
+            whole.run(rules, work, &mut self.scratch)
+        } else {
+            parallel::run(whole, block_envs, rules, work, &mut self.scratch)
+        };
     }
 }
 
@@ -269,7 +232,7 @@ impl<S: Simulator> Batch for SimBatch<S> {
     }
 
     fn reset(&mut self, seeds: Seeds<'_>, mask: Option<&[u8]>) -> Result<&StepBuffers, BatchError> {
-        let num_envs = self.slots.len();
+        let num_envs = self.options.num_envs;
         if let Some(mask) = mask {
             self.check_mask(mask)?;
         }
@@ -279,64 +242,30 @@ impl<S: Simulator> Batch for SimBatch<S> {
             return Err(BatchError::SeedsLength { expected: num_envs * 8, got: seeds.len(), num_envs });
         }
         // One draw from the system serves the whole batch, and is made before anything changes, as it can fail.
-        let entropy = if seeds == Seeds::Continue && !self.born {
-            getrandom::u64().map_err(|error| BatchError::Entropy(error.to_string()))?
-        } else {
-            0
-        };
-        self.clear_final();
-        for index in 0..num_envs {
-            if mask.is_none_or(|mask| mask[index] == 1) {
-                let rng = &mut self.slots[index].rng;
-                match seeds {
-                    Seeds::Continue => {
-                        rng.get_or_insert_with(|| dynamics(entropy.wrapping_add(index as u64)));
-                    }
-                    Seeds::From(seed) => *rng = Some(dynamics(seed.wrapping_add(index as u64))),
-                    Seeds::Each(seeds) => {
-                        let mut bits = [0; 8];
-                        bits.copy_from_slice(&seeds[index * 8..][..8]);
-                        *rng = Some(dynamics(u64::from_le_bytes(bits)));
-                    }
-                }
-                self.begin_episode(index);
-            }
-            self.set_outcome(index, 0.0, false, false);
-            self.observe(index, false);
-        }
+        let fresh = (seeds == Seeds::Continue && !self.born).then(getrandom::u64).transpose();
+        let fresh = fresh.map_err(|error| BatchError::Entropy(error.to_string()))?;
+        self.run(Work::Reset { seeds, mask, fresh });
         self.born = true;
         Ok(&self.buffers)
     }
 
     fn step(&mut self, actions: &[u8]) -> Result<&StepBuffers, BatchError> {
-        self.check_actions(actions)?;
-        self.clear_final();
-        for (index, action) in unpack(actions).enumerate() {
-            self.step_one(index, action as u32);
-        }
+        let actions = self.check_actions(actions)?;
+        self.run(Work::Step { actions });
         Ok(&self.buffers)
     }
 
     fn tabular_state(&self, index: usize) -> Result<u32, BatchError> {
-        Ok(self.slot(index)?.simulator.tabular_state())
+        Ok(self.environment(index)?.tabular_state())
     }
 
     fn render_text(&self, index: usize) -> Result<String, BatchError> {
-        Ok(self.slot(index)?.simulator.render_text())
+        Ok(self.environment(index)?.render_text())
     }
 
     fn render_svg(&self, index: usize) -> Result<String, BatchError> {
-        Ok(self.slot(index)?.simulator.render_svg())
+        Ok(self.environment(index)?.render_svg())
     }
-}
-
-/// Generator of an environment seeded with `seed`.
-fn dynamics(seed: u64) -> Rng {
-    stream(seed, Purpose::Dynamics)
-}
-
-fn unpack(actions: &[u8]) -> impl Iterator<Item = i32> + '_ {
-    actions.chunks_exact(4).map(|bytes| i32::from_le_bytes([bytes[0], bytes[1], bytes[2], bytes[3]]))
 }
 
 #[cfg(test)]

@@ -12,6 +12,19 @@ struct Chain {
 const STATES: u32 = 11;
 
 impl Simulator for Chain {
+    type Stored = Self;
+    const STEP_NANOS: usize = 1_000;
+
+    fn stored(&self) -> Self {
+        self.clone()
+    }
+
+    fn load<'a>(_scratch: &'a mut Self, stored: &'a mut Self) -> &'a mut Self {
+        stored
+    }
+
+    fn save(_scratch: &Self, _stored: &mut Self) {}
+
     fn reset(&mut self, rng: &mut Rng) {
         *self = Self { state: rng::below(rng, STATES), steps: 0 };
     }
@@ -319,4 +332,34 @@ fn the_action_mask_is_the_last_column() {
     assert_eq!(batch.info_columns().last().map(|column| column.name), Some(ACTION_MASK));
     let blocked = batch.tabular_state(0).unwrap() as usize % 3;
     assert_eq!(batch.buffers().info(1).iter().position(|&flag| flag == 0), Some(blocked));
+}
+
+#[test]
+fn cores_change_nothing() {
+    // Large enough for several blocks; chains end at random, so that every mode has its resets.
+    const ENVS: usize = 1_000;
+    assert!(ENVS > 8 * parallel::block_envs::<Chain>());
+    for autoreset in [Autoreset::NextStep, Autoreset::SameStep, Autoreset::Disabled] {
+        let replies = || {
+            let mut batch = batch(ENVS, autoreset, 7);
+            let mut replies = vec![batch.reset(Seeds::From(3), None).unwrap().clone()];
+            for step in 0..20 {
+                if autoreset == Autoreset::Disabled {
+                    let over: Vec<u8> = (0..ENVS).map(|i| u8::from(ended(&replies[replies.len() - 1], i))).collect();
+                    replies.push(batch.reset(Seeds::Continue, Some(&over)).unwrap().clone());
+                }
+                let actions: Vec<i32> = (0..ENVS as i32).map(|i| (i + step) % 3).collect();
+                replies.push(batch.step(&pack(&actions)).unwrap().clone());
+            }
+            replies
+        };
+        let on = |threads| rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap().install(replies);
+        let alone = on(1);
+        assert_eq!(alone[20].has_final(), autoreset == Autoreset::SameStep);
+        for threads in [2, 3, 7] {
+            assert!(on(threads) == alone, "{autoreset:?} on {threads} threads");
+        }
+        // Outside of any pool.
+        assert!(replies() == alone, "{autoreset:?} on all cores");
+    }
 }

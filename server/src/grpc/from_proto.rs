@@ -148,6 +148,7 @@ pub fn rollout(request: &pb::RolloutRequest, spec: &EnvSpec, limits: &RolloutLim
         steps: request.steps,
         burn_in_steps: request.burn_in_steps,
         totals_only: request.totals_only,
+        compact: request.compact,
         chunk_episodes: computed.min(sent).clamp(1, EPISODES_A_CHUNK) as u32,
     };
     plan.check(spec)?;

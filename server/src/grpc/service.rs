@@ -91,7 +91,7 @@ impl EnvironmentService for EnvironmentGrpc {
         tokio::task::spawn_blocking(move || {
             let _permit = permit;
             // Sending waits for the reader and fails once it has gone.
-            let mut emit = |chunk| sender.blocking_send(Ok(to_proto::episodes(&chunk))).is_ok();
+            let mut emit = |chunk| sender.blocking_send(Ok(to_proto::episodes(chunk))).is_ok();
             environment.roll_out(&plan, &|| sender.is_closed(), &mut emit);
         });
         Ok(Response::new(Box::pin(ReceiverStream::new(receiver))))

@@ -2,7 +2,7 @@
 
 use crate::{
     batch::{Autoreset, Batch, StepBuffers},
-    rollout::EpisodeChunk,
+    rollout::{EpisodeChunk, Width},
     sim::{DType, EnvSpec, InfoColumn, Space, TabularModel},
 };
 use bytes::Bytes;
@@ -172,14 +172,27 @@ fn pack_f64(values: &[f64]) -> Bytes {
     values.iter().flat_map(|value| value.to_le_bytes()).collect()
 }
 
-/// Some episodes of a roll-out.
-pub fn episodes(chunk: &EpisodeChunk) -> pb::RolloutResponse {
+fn width(width: Width) -> i32 {
+    match width {
+        // What needs not be told, so that clients that do not know of it understand the rest.
+        Width::Four => pb::DType::Unspecified,
+        Width::One => pb::DType::Uint8,
+        Width::Two => pb::DType::Uint16,
+    }
+    .into()
+}
+
+/// Some episodes of a roll-out; the arrays of every step are moved, not copied.
+pub fn episodes(chunk: EpisodeChunk) -> pb::RolloutResponse {
     pb::RolloutResponse {
         first_episode: chunk.first_episode,
         lengths: pack_u32(&chunk.lengths),
-        states: pack_u32(&chunk.states),
-        actions: pack_u32(&chunk.actions),
-        rewards: pack_f64(&chunk.rewards),
+        states_dtype: width(chunk.steps.format.states),
+        actions_dtype: width(chunk.steps.format.actions),
+        reward_values: pack_f64(&chunk.steps.reward_values),
+        states: chunk.steps.states.into(),
+        actions: chunk.steps.actions.into(),
+        rewards: chunk.steps.rewards.into(),
         final_states: pack_u32(&chunk.final_states),
         terminated: chunk.terminated.iter().map(|&flag| u8::from(flag)).collect(),
         returns: pack_f64(&chunk.returns),

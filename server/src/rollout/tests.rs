@@ -1,7 +1,10 @@
 use super::*;
 use crate::{
     batch::{Autoreset, Batch, BatchOptions, Seeds, SimBatch},
-    sim::{highway, maze},
+    sim::{
+        highway, maze,
+        rng::{Purpose, stream},
+    },
 };
 use proptest::prelude::*;
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -22,31 +25,50 @@ fn plan(controller: Controller) -> RolloutPlan {
         steps: 17,
         burn_in_steps: 0,
         totals_only: false,
+        compact: false,
         chunk_episodes: 8,
     }
 }
 
-fn run(plan: &RolloutPlan) -> EpisodeChunk {
-    let mut all: Option<EpisodeChunk> = None;
-    plan.check(&maze().spec).unwrap();
-    roll_out(&maze(), plan, &|| false, &mut |chunk| {
-        assert!(chunk.lengths.len() <= plan.chunk_episodes as usize);
-        match &mut all {
-            None => all = Some(chunk),
-            Some(all) => {
-                assert_eq!(chunk.first_episode as usize, all.lengths.len());
-                all.lengths.extend(chunk.lengths);
-                all.states.extend(chunk.states);
-                all.actions.extend(chunk.actions);
-                all.rewards.extend(chunk.rewards);
-                all.final_states.extend(chunk.final_states);
-                all.terminated.extend(chunk.terminated);
-                all.returns.extend(chunk.returns);
-            }
-        }
-        true
-    });
-    all.unwrap()
+/// A whole roll-out, unpacked.
+#[derive(Debug, Clone, Default, PartialEq)]
+struct All {
+    lengths: Vec<u32>,
+    states: Vec<u32>,
+    actions: Vec<u32>,
+    rewards: Vec<f64>,
+    final_states: Vec<u32>,
+    terminated: Vec<bool>,
+    returns: Vec<f64>,
+    totals: Vec<Vec<f64>>,
+}
+
+impl All {
+    fn of<S: Simulator>(configured: &Configured<S>, plan: &RolloutPlan) -> (Self, Vec<StepFormat>) {
+        let (mut all, mut formats) = (Self::default(), Vec::new());
+        plan.check(&configured.spec).unwrap();
+        roll_out(configured, plan, &|| false, &mut |chunk| {
+            assert!(chunk.lengths.len() <= plan.chunk_episodes as usize);
+            assert_eq!(chunk.first_episode as usize, all.lengths.len());
+            let steps = chunk.steps;
+            all.lengths.extend(chunk.lengths);
+            all.states.extend((0..steps.len()).map(|at| steps.state(at)));
+            all.actions.extend((0..steps.len()).map(|at| steps.action(at)));
+            all.rewards.extend((0..steps.len()).map(|at| steps.reward(at)));
+            all.final_states.extend(chunk.final_states);
+            all.terminated.extend(chunk.terminated);
+            all.returns.extend(chunk.returns);
+            all.totals.resize(chunk.totals.len(), Vec::new());
+            all.totals.iter_mut().zip(chunk.totals).for_each(|(all, more)| all.extend(more));
+            formats.push(steps.format);
+            true
+        });
+        (all, formats)
+    }
+}
+
+fn run(plan: &RolloutPlan) -> All {
+    All::of(&maze(), plan).0
 }
 
 #[test]
@@ -60,8 +82,53 @@ fn threads_and_chunks_change_nothing() {
         }
         for chunk_episodes in [1, 5, 100] {
             assert_eq!(run(&RolloutPlan { chunk_episodes, ..plan(controller.clone()) }), reference);
+            assert_eq!(run(&RolloutPlan { chunk_episodes, compact: true, ..plan(controller.clone()) }), reference);
         }
     }
+}
+
+/// A highway whose episodes end at random lengths, driven over many groups.
+fn crashes(compact: bool) -> RolloutPlan {
+    RolloutPlan { compact, episodes: 90, steps: 300, chunk_episodes: 40, ..plan(Controller::Driver("bad".into())) }
+}
+
+#[test]
+fn compact_steps_are_the_same_steps() {
+    let options = serde_json::json!({"terminate_on_collision": true, "style": "legal"});
+    let highway = highway::configure(options.as_object().unwrap()).unwrap();
+    let (whole, formats) = All::of(&highway, &crashes(false));
+    let widths = StepFormat { states: Width::Four, actions: Width::Four, rewards: RewardFormat::Values };
+    assert_eq!(formats, [widths; 3]);
+    assert!(whole.lengths.iter().any(|&length| length < 300) && whole.rewards.iter().any(|&reward| reward < 0.0));
+    for threads in [1, 3] {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        let (compact, formats) = pool.install(|| All::of(&highway, &crashes(true)));
+        let widths = StepFormat { states: Width::One, actions: Width::One, rewards: RewardFormat::Ranks };
+        assert_eq!(formats, [widths; 3]);
+        assert_eq!(compact, whole);
+    }
+}
+
+#[test]
+fn rewards_too_many_for_ranks_and_states_too_many_for_a_byte_stay_whole() {
+    let rewards: Vec<f64> = (0..300).map(|state| f64::from(state) / 7.0).collect();
+    let options = serde_json::json!({"layout": [".".repeat(300)], "rewards": rewards, "slip": 0.0});
+    let maze = maze::configure(options.as_object().unwrap()).unwrap();
+    // Ten steps from anywhere: the first chunks have few rewards, a later one has too many.
+    let plan = |compact, chunk_episodes| RolloutPlan {
+        compact,
+        chunk_episodes,
+        episodes: 300,
+        steps: 10,
+        ..plan(Controller::Driver("random".into()))
+    };
+    let (whole, _) = All::of(&maze, &plan(false, 300));
+    let (compact, formats) = All::of(&maze, &plan(true, 20));
+    assert_eq!(compact, whole);
+    assert!(formats.iter().all(|format| format.states == Width::Two && format.actions == Width::One));
+    assert_eq!(formats[0].rewards, RewardFormat::Ranks);
+    let (compact, formats) = All::of(&maze, &plan(true, 300));
+    assert_eq!((compact, formats[0].rewards), (whole, RewardFormat::Values));
 }
 
 #[test]
@@ -118,7 +185,8 @@ fn an_episode_that_ends_in_burn_in_begins_anew() {
         chunks.push(chunk);
         true
     });
-    let states: Vec<_> = chunks.iter().flat_map(|chunk| chunk.states.clone()).collect();
+    let states: Vec<_> =
+        chunks.iter().flat_map(|chunk| (0..chunk.steps.len()).map(|at| chunk.steps.state(at))).collect();
     let lengths: Vec<_> = chunks.iter().flat_map(|chunk| chunk.lengths.clone()).collect();
     let terminated: Vec<_> = chunks.iter().flat_map(|chunk| chunk.terminated.clone()).collect();
     assert!(terminated.iter().any(|&flag| flag));

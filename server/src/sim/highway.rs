@@ -21,7 +21,7 @@ use std::sync::Arc;
 
 use serde_json::{Map, Value, json};
 
-use self::road::{Events, FRONT_M, LANES, LEVEL_SPEED_MPS, LEVELS, MAX_VEHICLES, Road, target_lane};
+use self::road::{Events, FRONT_M, LANES, LEVEL_SPEED_MPS, LEVELS, MAX_VEHICLES, Road, View, target_lane};
 use super::{
     Configured, DType, Driver, EnvSpec, InfoColumn, OptionError, OptionSpec, Outcome, Rng, Simulator, Space,
     drivers::RandomDriver, options,
@@ -80,6 +80,8 @@ impl Style {
 #[derive(Debug, Clone)]
 pub struct Highway {
     road: Road,
+    /// What the host sees of the road as it is: the observation, the infos, the mask and the next step all ask for it.
+    view: View,
     /// What the last step brought; nothing after a reset.
     events: Events,
     style: Style,
@@ -120,7 +122,8 @@ pub fn configure(given: &Map<String, Value>) -> Result<Configured<Highway>, Opti
         styles: STYLES.to_vec(),
         render_fps: 2,
     };
-    let prototype = Highway { road, events: Events::default(), style, kinematics, terminate_on_collision };
+    let prototype =
+        Highway { view: road.view(), road, events: Events::default(), style, kinematics, terminate_on_collision };
     Ok(Configured { spec: Arc::new(spec), prototype })
 }
 
@@ -208,7 +211,7 @@ pub fn action_label(action: u32) -> String {
 impl Highway {
     /// 0 clear, 1 passable, 2 boxed in.
     fn traffic(&self) -> usize {
-        let (view, lane) = (self.road.view(), self.road.host_lane);
+        let (view, lane) = (&self.view, self.road.host_lane);
         if view.clear(lane) {
             0
         } else if [1, 2].into_iter().any(|change| target_lane(lane, change).is_some_and(|lane| view.free(lane))) {
@@ -239,13 +242,30 @@ impl Highway {
 }
 
 impl Simulator for Highway {
+    type Stored = Self;
+    const STEP_NANOS: usize = 210;
+
+    fn stored(&self) -> Self {
+        self.clone()
+    }
+
+    #[inline]
+    fn load<'a>(_scratch: &'a mut Self, stored: &'a mut Self) -> &'a mut Self {
+        stored
+    }
+
+    #[inline]
+    fn save(_scratch: &Self, _stored: &mut Self) {}
+
     fn reset(&mut self, rng: &mut Rng) {
         self.road.reset(rng);
+        self.view = self.road.view();
         self.events = Events::default();
     }
 
     fn step(&mut self, action: u32, rng: &mut Rng) -> Outcome {
-        self.events = self.road.advance(action as usize / LEVELS, action as usize % LEVELS, rng);
+        self.events = self.road.advance(&self.view, action as usize / LEVELS, action as usize % LEVELS, rng);
+        self.view = self.road.view();
         let Events { collisions, overtakes_right, .. } = self.events;
         let reward = self.style.reward(self.road.host_speed_mps(), f64::from(collisions), f64::from(overtakes_right));
         Outcome { reward, terminated: self.terminate_on_collision && collisions > 0 }
@@ -278,13 +298,13 @@ impl Simulator for Highway {
             OVERTAKES_RIGHT => f64::from(self.events.overtakes_right),
             SPEED => self.road.host_speed_mps(),
             LANE => self.road.host_lane as f64,
-            GAP => self.road.view().ahead_m[self.road.host_lane].min(FRONT_M),
+            GAP => self.view.ahead_m[self.road.host_lane].min(FRONT_M),
             _ => f64::NAN,
         }
     }
 
     fn write_action_mask(&self, out: &mut [u8]) {
-        let (view, lane) = (self.road.view(), self.road.host_lane);
+        let (view, lane) = (&self.view, self.road.host_lane);
         for (change, flags) in out.chunks_exact_mut(LEVELS).enumerate() {
             let possible = change == 0 || target_lane(lane, change).is_some_and(|lane| view.room(lane));
             flags.fill(u8::from(possible));

@@ -62,6 +62,8 @@ struct Tables {
     direction_scale: f64,
     /// State entered, shape `(n_states, 4)`.
     next: Vec<u32>,
+    /// Row and column of each state, packed as the info columns are.
+    positions: Vec<[[u8; 4]; 2]>,
     /// The optimal actions of each state as a bit mask, made when first asked for.
     optimal: OnceLock<Vec<u8>>,
 }
@@ -104,6 +106,7 @@ pub fn configure(given: &Map<String, Value>) -> Result<Configured<Maze>, OptionE
     let slip_below = (slip * DRAWS) as u64;
     let tables = Tables {
         next: layout.moves(),
+        positions: layout.positions().map(|(row, column)| [row, column].map(|at| (at as i32).to_le_bytes())).collect(),
         layout,
         slip,
         slip_below,
@@ -188,6 +191,24 @@ impl Tables {
 }
 
 impl Simulator for Maze {
+    type Stored = u32;
+    const STEP_NANOS: usize = 9;
+
+    fn stored(&self) -> u32 {
+        self.state
+    }
+
+    #[inline]
+    fn load<'a>(scratch: &'a mut Self, stored: &'a mut u32) -> &'a mut Self {
+        scratch.state = *stored;
+        scratch
+    }
+
+    #[inline]
+    fn save(scratch: &Self, stored: &mut u32) {
+        *stored = scratch.state;
+    }
+
     fn reset(&mut self, rng: &mut Rng) {
         self.state = below(rng, self.tables.layout.n_states());
     }
@@ -196,11 +217,9 @@ impl Simulator for Maze {
     fn step(&mut self, action: u32, rng: &mut Rng) -> Outcome {
         let tables = &*self.tables;
         let draw = rng.next_u64() >> 11;
-        let direction = if draw < tables.slip_below {
-            ((draw as f64 * tables.direction_scale) as usize).min(3)
-        } else {
-            action as usize
-        };
+        // Nobody can foretell whether it slips: both directions are at hand, and none is jumped to.
+        let slipping = ((draw as f64 * tables.direction_scale) as u32).min(3);
+        let direction = std::hint::select_unpredictable(draw < tables.slip_below, slipping, action) as usize;
         self.state = tables.next[self.state as usize * 4 + direction];
         Outcome { reward: tables.layout.rewards[self.state as usize], terminated: false }
     }
@@ -209,12 +228,34 @@ impl Simulator for Maze {
         self.state
     }
 
+    #[inline]
     fn write_observation(&self, out: &mut [u8]) {
         out.copy_from_slice(&(self.state as i32).to_le_bytes());
     }
 
     fn write_info(&self, column: usize, out: &mut [u8]) {
-        out.copy_from_slice(&(self.info_value(column) as i32).to_le_bytes());
+        out.copy_from_slice(&self.tables.positions[self.state as usize][column]);
+    }
+
+    fn write_rows(
+        scratch: &mut Self,
+        stored: &mut [u32],
+        first: usize,
+        observations: &mut [u8],
+        _observation_len: usize,
+        infos: &mut [&mut [u8]],
+        _info_lens: &[usize],
+    ) {
+        for (out, state) in observations.as_chunks_mut().0[first..].iter_mut().zip(&*stored) {
+            *out = state.to_le_bytes();
+        }
+        if let [rows, columns] = infos {
+            let rows = rows.as_chunks_mut().0[first..].iter_mut();
+            let columns = columns.as_chunks_mut().0[first..].iter_mut();
+            for ((row, column), &state) in rows.zip(columns).zip(&*stored) {
+                [*row, *column] = scratch.tables.positions[state as usize];
+            }
+        }
     }
 
     fn info_value(&self, column: usize) -> f64 {

@@ -143,6 +143,16 @@ pub struct Outcome {
 ///
 /// The caller upholds: `reset` before the first `step`; `action < n_actions`; buffers of the sizes that the spec says.
 pub trait Simulator: Clone + Send + Sync + 'static {
+    /// What a batch keeps of one environment: all but what the environments of one configuration share.
+    type Stored: Clone + Send + Sync + 'static;
+    /// Rough time of a step and its packing on one core, which decides from what size on several cores pay.
+    const STEP_NANOS: usize;
+    /// What [`Self::load`] needs to go on from here.
+    fn stored(&self) -> Self::Stored;
+    /// The environment that `stored` keeps: `stored` itself, or `scratch` made into it.
+    fn load<'a>(scratch: &'a mut Self, stored: &'a mut Self::Stored) -> &'a mut Self;
+    /// Keeps what [`Self::load`] gave out, where that was `scratch`.
+    fn save(scratch: &Self, stored: &mut Self::Stored);
     /// Begins an episode, drawing from `rng`.
     fn reset(&mut self, rng: &mut Rng);
     /// Advances one decision. Neither allocates nor locks.
@@ -157,6 +167,25 @@ pub trait Simulator: Clone + Send + Sync + 'static {
     fn info_value(&self, column: usize) -> f64;
     /// One byte an action, 1 where the action has its full effect; `out` has `n_actions` bytes.
     fn write_action_mask(&self, out: &mut [u8]);
+    /// Packs the observations and infos of neighbouring environments of a batch, the first of which has row `first` of each
+    /// array; `info_lens` are the bytes of a row of each info column. Small simulators do it an array at a time.
+    fn write_rows(
+        scratch: &mut Self,
+        stored: &mut [Self::Stored],
+        first: usize,
+        observations: &mut [u8],
+        observation_len: usize,
+        infos: &mut [&mut [u8]],
+        info_lens: &[usize],
+    ) {
+        for (i, stored) in stored.iter_mut().enumerate() {
+            let (simulator, row) = (Self::load(scratch, stored), first + i);
+            simulator.write_observation(&mut observations[row * observation_len..][..observation_len]);
+            for (column, (out, &len)) in infos.iter_mut().zip(info_lens).enumerate() {
+                simulator.write_info(column, &mut out[row * len..][..len]);
+            }
+        }
+    }
     /// Draws as text.
     fn render_text(&self) -> String;
     /// Draws as an SVG document, to be rasterised by the caller.

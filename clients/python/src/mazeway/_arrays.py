@@ -16,6 +16,7 @@ from mazeway.errors import InvalidArgumentError, ServerFailureError
 
 _DTYPES: dict[int, np.dtype[Any]] = {
     _wire.env.DType["D_TYPE_UINT8"]: np.dtype("u1"),
+    _wire.env.DType["D_TYPE_UINT16"]: np.dtype("<u2"),
     _wire.env.DType["D_TYPE_INT32"]: np.dtype("<i4"),
     _wire.env.DType["D_TYPE_INT64"]: np.dtype("<i8"),
     _wire.env.DType["D_TYPE_FLOAT32"]: np.dtype("<f4"),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -180,6 +180,7 @@ class Client:
             seed=check_seed(seed),
             burn_in_steps=burn_in_steps,
             totals_only=totals_only,
+            compact=True,  # the same numbers in fewer bytes
         )
         for name, value in (("episodes", episodes), ("steps", steps)):
             if value < 1:
@@ -198,13 +199,15 @@ class Client:
         sizes = self._sizes(request.env_id, options or {})
         source = "policy" if policy is not None else f"driver:{request.driver}"
         parts = list(self._transport.responses("Rollout", request, timeout=self.timeout))
-        joined = {
-            name: np.concatenate([_arrays.unpack(getattr(part, name), dtype) for part in parts])
+        joined: dict[str, npt.NDArray[Any]] = {
+            "states": _join(_integers(part.states, part.states_dtype) for part in parts),
+            "actions": _join(_integers(part.actions, part.actions_dtype) for part in parts),
+            "rewards": _join(_rewards(part) for part in parts),
+        }
+        joined |= {
+            name: _join(_arrays.unpack(getattr(part, name), dtype) for part in parts)
             for name, dtype in (
                 ("lengths", _arrays.INT32),
-                ("states", _arrays.INT32),
-                ("actions", _arrays.INT32),
-                ("rewards", _arrays.FLOAT64),
                 ("final_states", _arrays.INT32),
                 ("returns", _arrays.FLOAT64),
                 ("terminated", _arrays.UINT8),
@@ -233,6 +236,23 @@ class Client:
             return spec.n_states, spec.n_actions
         finally:
             session.close()
+
+
+def _join(parts: Iterable[npt.NDArray[Any]]) -> npt.NDArray[Any]:
+    return np.concatenate(list(parts))
+
+
+def _integers(data: bytes, dtype: int) -> npt.NDArray[np.int32]:
+    """States or actions, of the element type that the message tells; none means int32."""
+    return np.frombuffer(data, _arrays.dtype_of(dtype) if dtype else _arrays.INT32).astype(np.int32)
+
+
+def _rewards(part: Any) -> npt.NDArray[np.float64]:
+    """The rewards of a message, or those whose ranks it holds."""
+    if not part.reward_values:
+        return _arrays.unpack(part.rewards, _arrays.FLOAT64)
+    values = _arrays.unpack(part.reward_values, _arrays.FLOAT64)
+    return values[np.frombuffer(part.rewards, _arrays.UINT8)]
 
 
 def _environment(spec: Any) -> Environment:

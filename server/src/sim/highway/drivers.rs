@@ -27,7 +27,7 @@ pub(super) struct Aggressive;
 
 impl Driver<Highway> for Aggressive {
     fn act(&mut self, highway: &Highway, _rng: &mut Rng) -> u32 {
-        let (view, lane) = (highway.road.view(), highway.road.host_lane);
+        let (view, lane) = (&highway.view, highway.road.host_lane);
         if view.clear(lane) {
             return action(KEEP, FASTEST);
         }
@@ -59,13 +59,13 @@ impl Bad {
 
 impl Driver<Highway> for Bad {
     fn act(&mut self, highway: &Highway, _rng: &mut Rng) -> u32 {
-        let (view, lane) = (highway.road.view(), highway.road.host_lane);
-        let mut best = (KEEP, Self::hit_secs(&view, lane) - Self::WORTH_SECS);
+        let (view, lane) = (&highway.view, highway.road.host_lane);
+        let mut best = (KEEP, Self::hit_secs(view, lane) - Self::WORTH_SECS);
         for change in [LEFT, RIGHT] {
             if let Some(lane) = target_lane(lane, change as usize)
                 && view.room(lane)
             {
-                let secs = Self::hit_secs(&view, lane);
+                let secs = Self::hit_secs(view, lane);
                 if secs < best.1 {
                     best = (change, secs);
                 }
@@ -85,7 +85,7 @@ impl Legal {
 
 impl Driver<Highway> for Legal {
     fn act(&mut self, highway: &Highway, _rng: &mut Rng) -> u32 {
-        let (view, lane) = (highway.road.view(), highway.road.host_lane);
+        let (view, lane) = (&highway.view, highway.road.host_lane);
         if lane + 1 < LANES {
             // At the slowest level nobody on the left is passed while it waits for room.
             return action(LEFT, 0);

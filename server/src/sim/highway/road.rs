@@ -197,12 +197,13 @@ impl Road {
         view
     }
 
-    /// One second: the host changes lane and speed, then some vehicles change lanes, then all move.
-    pub(super) fn advance(&mut self, change: usize, level: usize, rng: &mut Rng) -> Events {
+    /// One second: the host changes lane and speed, then some vehicles change lanes, then all move. `view` is
+    /// [`Self::view`].
+    pub(super) fn advance(&mut self, view: &View, change: usize, level: usize, rng: &mut Rng) -> Events {
         self.host_level = level;
         if change != 0
             && let Some(lane) = target_lane(self.host_lane, change)
-            && self.view().room(lane)
+            && view.room(lane)
         {
             self.host_lane = lane;
         }

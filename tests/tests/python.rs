@@ -1,8 +1,10 @@
 //! The Python client, installed into virtual environments under the target directory, against the real programs:
-//! its whole suite with the newest dependencies and with the oldest that it promises to work with.
+//! its whole suite, for the native and the pure client, with the newest dependencies and with the oldest that it promises
+//! to work with.
 //!
 //! Needs Python 3.10 or later with `venv` (`PYTHON` names another than `python3`) and, for the first run, a package
-//! index. An environment is made anew when the requirements change; runs that share a target directory take turns.
+//! index. An environment is made anew when the requirements change; runs that share a target directory take turns. The
+//! wheel with the native client is built once, unoptimised, with what cargo has built already.
 
 use mazeway_tests::programs::program;
 use prost::Message as _;
@@ -11,6 +13,7 @@ use std::{
     fs::File,
     path::{Path, PathBuf},
     process::{Command, Stdio},
+    sync::LazyLock,
     thread,
     time::{Duration, Instant},
 };
@@ -49,6 +52,41 @@ fn suite_passes_with_the_oldest_dependencies() {
     assert!(unexpected.is_none(), "tests were skipped without a reason to:\n{said}");
 }
 
+#[test]
+fn package_builds_and_runs_without_a_compiler() {
+    let python = Venv::new("newest", None);
+    let wheel = build_wheel(&python, "pure", &[("MAZEWAY_PURE", "1")]);
+    let name = wheel.file_name().expect("a name").to_string_lossy().into_owned();
+    assert!(name.ends_with("-py3-none-any.whl"), "{name}");
+    let code = "import sys; sys.path.insert(0, sys.argv[1]); import mazeway; from mazeway import _transport; \
+        assert sys.argv[1] in mazeway.__file__, mazeway.__file__; assert not _transport.has_native(); \
+        print(mazeway.Client('127.0.0.1:1')._transport)";
+    let said = python.python(&["-c", code, wheel.to_str().expect("a path in UTF-8")], &[]);
+    assert!(said.contains("GrpcTransport"), "{said}");
+}
+
+/// The wheel with the native client, as every test installs it.
+static WHEEL: LazyLock<PathBuf> = LazyLock::new(|| {
+    let python = Venv::bare("build", None);
+    // The profile is the tests' own, so that the libraries need not be built again.
+    build_wheel(&python, "native", &[("MATURIN_PEP517_ARGS", "--profile dev --locked")])
+});
+
+/// Builds a wheel into a directory of its own.
+fn build_wheel(python: &Venv, name: &str, environment: &[(&str, &str)]) -> PathBuf {
+    let directory = python.directory.with_file_name(format!("wheel-{name}"));
+    if directory.exists() {
+        fs::remove_dir_all(&directory).expect("an outdated wheel that can be removed");
+    }
+    let into = directory.to_str().expect("a path in UTF-8");
+    python.python(
+        &["-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", "--wheel-dir", into, "."],
+        environment,
+    );
+    let mut wheels = fs::read_dir(&directory).expect("a directory").map(|entry| entry.expect("an entry").path());
+    wheels.next().expect("a wheel")
+}
+
 /// Directory of the Python package.
 fn package() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../clients/python").canonicalize().expect("clients/python")
@@ -61,7 +99,16 @@ struct Venv {
 }
 
 impl Venv {
+    /// With the package as users get it.
     fn new(name: &str, constraints: Option<&str>) -> Self {
+        let wheel = WHEEL.to_str().expect("a path in UTF-8");
+        let venv = Self::bare(name, constraints);
+        venv.run("pip", &["install", "--quiet", "--no-deps", "--force-reinstall", wheel]);
+        venv
+    }
+
+    /// With the requirements alone.
+    fn bare(name: &str, constraints: Option<&str>) -> Self {
         let home = Path::new(env!("CARGO_TARGET_TMPDIR")).join("python");
         fs::create_dir_all(&home).expect("a directory for virtual environments");
         let lock = File::create(home.join(format!("{name}.lock"))).expect("a lock file");
@@ -70,7 +117,8 @@ impl Venv {
 
         let interpreter = env::var("PYTHON").unwrap_or_else(|_| "python3".into());
         let version = "import sys; assert sys.version_info >= (3, 10), sys.version; print(sys.version, sys.executable)";
-        let version = finish(Command::new(&interpreter).args(["-c", version]), &home.join("version.log"));
+        let log = home.join(format!("{name}-version.log"));
+        let version = finish(Command::new(&interpreter).args(["-c", version]), &log);
         let project = fs::read_to_string(package().join("pyproject.toml")).expect("pyproject.toml");
         let pins = constraints.map(|path| fs::read_to_string(package().join(path)).expect("constraints"));
         let wanted = format!("{version}{project}{}", pins.unwrap_or_default());
@@ -81,28 +129,35 @@ impl Venv {
             }
             let directory = venv.directory.to_str().expect("a path in UTF-8").to_owned();
             finish(Command::new(&interpreter).args(["-m", "venv", &directory]), &home.join(format!("{name}.log")));
-            let mut arguments = vec!["install", "--quiet", ".[test]"];
+            let mut arguments = vec!["-m", "pip", "install", "--quiet", ".[test]"];
             if let Some(path) = constraints {
                 arguments.extend(["--constraint", path]);
             }
-            venv.run("pip", &arguments);
+            // Brings what the package needs; the package itself is replaced by a wheel.
+            venv.python(&arguments, &[("MAZEWAY_PURE", "1")]);
             fs::write(stamp, wanted).expect("a stamp");
         }
-        // The package itself is installed anew each time: a wheel, as users get it.
-        venv.run("pip", &["install", "--quiet", "--no-deps", "--force-reinstall", "--no-build-isolation", "."]);
         venv
     }
 
     /// Runs a module of the environment in the package's directory, with the real programs at hand; returns what it
     /// said. Panics with that where it fails.
     fn run(&self, module: &str, arguments: &[&str]) -> String {
+        self.python(&[&["-m", module], arguments].concat(), &[])
+    }
+
+    fn python(&self, arguments: &[&str], environment: &[(&str, &str)]) -> String {
         let scripts = self.directory.join(if cfg!(windows) { "Scripts" } else { "bin" });
         let mut command = Command::new(scripts.join("python"));
-        command.arg("-m").arg(module).args(arguments).current_dir(package());
+        command.args(arguments).current_dir(package());
         command
             .env("MAZEWAY_BIN_DIR", program("server").parent().expect("a directory"))
             .env("PYTHONDONTWRITEBYTECODE", "1");
         command.env("PIP_DISABLE_PIP_VERSION_CHECK", "1").env("RUFF_NO_CACHE", "true");
+        // The environment's own tools come first: the package's build looks for them by name.
+        let path = env::var_os("PATH").unwrap_or_default();
+        let path = env::join_paths([scripts].into_iter().chain(env::split_paths(&path))).expect("a search path");
+        command.env("PATH", path).envs(environment.iter().copied());
         finish(&mut command, &self.directory.with_extension("log"))
     }
 }

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from mazeway import _transport
+
 REPOSITORY = Path(__file__).resolve().parents[3]
 DATA = REPOSITORY / "tests" / "data"
 
@@ -79,6 +81,15 @@ def start_learner(directory, *arguments, listen="127.0.0.1:0"):
         *arguments,
         log=directory / "learner.log",
     )
+
+
+@pytest.fixture(params=["native", "grpc"], autouse=True)
+def which_client(request, monkeypatch):
+    """Every test is run with both clients, in the processes that it starts, too."""
+    if request.param == "native" and not _transport.has_native():
+        pytest.skip("the native client is not built")
+    monkeypatch.setenv(_transport.CLIENT_VARIABLE, request.param)
+    return request.param
 
 
 @pytest.fixture(scope="session")

@@ -173,15 +173,24 @@ impl Session {
             action_masks: options.action_masks,
         };
         let answer = connection.service.clone().create_session(request).await?.into_inner();
-        let spec = answer.spec.ok_or_else(|| ClientError::protocol("expected a description of the session"))?;
-        let lease = answer.lease.and_then(|lease| Duration::try_from(lease).ok()).unwrap_or(RESUME);
+        Self::attach(connection, answer, options.resume_within)
+    }
+
+    /// Over a session that exists, as the server described it.
+    pub fn attach(
+        connection: Connection,
+        created: pb::CreateSessionResponse,
+        resume_within: Option<Duration>,
+    ) -> Result<Self, ClientError> {
+        let spec = created.spec.ok_or_else(|| ClientError::protocol("expected a description of the session"))?;
+        let lease = created.lease.and_then(|lease| Duration::try_from(lease).ok()).unwrap_or(RESUME);
         Ok(Self {
             connection,
-            id: answer.session_id,
+            id: created.session_id,
             spec: EnvSpec::from_wire(spec)?,
-            num_envs: answer.num_envs as usize,
-            max_episode_steps: answer.max_episode_steps,
-            resume_within: options.resume_within.unwrap_or(RESUME).min(lease),
+            num_envs: created.num_envs as usize,
+            max_episode_steps: created.max_episode_steps,
+            resume_within: resume_within.unwrap_or(RESUME).min(lease),
             open: None,
             closed: false,
         })

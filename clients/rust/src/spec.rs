@@ -186,6 +186,14 @@ impl EnvSpec {
     }
 }
 
+impl TryFrom<pb::EnvironmentSpec> for EnvSpec {
+    type Error = ClientError;
+
+    fn try_from(spec: pb::EnvironmentSpec) -> Result<Self, ClientError> {
+        Self::from_wire(spec)
+    }
+}
+
 pub(crate) fn options_to_wire(options: &Options) -> Option<prost_types::Struct> {
     let fields = options.iter().map(|(name, value)| (name.clone(), value_to_wire(value)));
     (!options.is_empty()).then(|| prost_types::Struct { fields: fields.collect() })

@@ -9,7 +9,7 @@ use crate::{
 };
 use bytes::Bytes;
 use mazeway_proto::env::{self as pb, interact_request::Request, interact_response::Response};
-use std::sync::Arc;
+use std::{sync::Arc, time::Duration};
 
 /// How the environments of a reset are seeded.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
@@ -96,9 +96,29 @@ impl VectorEnv {
         autoreset: Autoreset,
         options: SessionOptions,
     ) -> Result<Self, ClientError> {
-        let session = Session::create(connection.clone(), env_id, num_envs, autoreset, options).await?;
+        Ok(Self::over(Session::create(connection.clone(), env_id, num_envs, autoreset, options).await?, autoreset))
+    }
+
+    /// Takes up a session that is there already, from what the server said when it was made. Nothing is sent.
+    ///
+    /// # Errors
+    /// A description that is none.
+    pub fn attach(
+        connection: &Connection,
+        created: pb::CreateSessionResponse,
+        resume_within: Option<Duration>,
+    ) -> Result<Self, ClientError> {
+        let autoreset = match created.autoreset_mode() {
+            pb::AutoresetMode::SameStep => Autoreset::SameStep,
+            pb::AutoresetMode::Disabled => Autoreset::Disabled,
+            pb::AutoresetMode::NextStep | pb::AutoresetMode::Unspecified => Autoreset::NextStep,
+        };
+        Ok(Self::over(Session::attach(connection.clone(), created, resume_within)?, autoreset))
+    }
+
+    fn over(session: Session, autoreset: Autoreset) -> Self {
         let columns = session.spec.info_columns.clone().into();
-        Ok(Self { session, columns, autoreset })
+        Self { session, columns, autoreset }
     }
 
     /// The environment as configured.

@@ -71,6 +71,18 @@ def pack(values: npt.ArrayLike, dtype: np.dtype[Any], shape: Sequence[int], what
     return array.astype(dtype).tobytes()
 
 
+def integers(values: npt.ArrayLike, shape: tuple[int, ...], what: str) -> npt.NDArray[np.int64]:
+    """A contiguous int64 array; raises InvalidArgumentError for another shape or what are no integers."""
+    array = np.asarray(values)
+    if array.shape != shape:
+        raise InvalidArgumentError(f"{what}: expected shape {shape}, got {array.shape}", field=what)
+    if array.dtype.kind not in "iub" and array.size:
+        raise InvalidArgumentError(f"{what}: expected integers, got {array.dtype}", field=what)
+    if array.dtype == np.uint64 and array.size and array.max() > np.iinfo(np.int64).max:
+        pack(array, INT32, shape, what)  # says what is wrong
+    return np.ascontiguousarray(array, np.int64)
+
+
 def space_from_wire(space: Any) -> gymnasium.Space[Any]:
     """The Gymnasium space of a wire `Space`: Discrete (int64, as Gymnasium expects) or Box."""
     kind = space.WhichOneof("kind")

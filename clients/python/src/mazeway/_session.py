@@ -10,12 +10,17 @@ from __future__ import annotations
 import contextlib
 import os
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
+
+import numpy as np
+import numpy.typing as npt
 
 from mazeway import _arrays, _wire
-from mazeway._transport import Exchange, Transport, connect
+from mazeway._link import First, Link, Stepped, SteppedOne
+from mazeway._link import link as make_link
+from mazeway._transport import Transport, choose, connect
 from mazeway.errors import (
     DeadlineExceededError,
     InvalidArgumentError,
@@ -24,12 +29,18 @@ from mazeway.errors import (
     ResetNeededError,
     ServerUnreachableError,
     SessionLostError,
+    WrongStateError,
 )
+
+T = TypeVar("T")
 
 _AUTORESET = _wire.env.AutoresetMode
 
 DEFAULT_ADDRESS = "127.0.0.1:50051"
 DEFAULT_TIMEOUT_SECS = 60.0
+
+#: Steps that may be sent before their answers are received.
+MAX_PENDING = 1024
 
 #: Closing is a courtesy, for sessions expire: a server that does not answer must not hold it up.
 _CLOSE_TIMEOUT_SECS = 1.0
@@ -40,10 +51,10 @@ class _Connection:
     """What belongs to one process and one session on the server."""
 
     transport: Transport
+    link: Link
     session_id: str
     timeout: float
     pid: int
-    exchange: Exchange | None = None
 
     def release(self) -> None:
         """Closes the session and the connection; a child leaves its parent's alone."""
@@ -51,20 +62,12 @@ class _Connection:
             return
         timeout = min(self.timeout, _CLOSE_TIMEOUT_SECS)
         with contextlib.suppress(MazewayError):
-            if self.exchange is not None and self.exchange.alive:
-                request = _wire.env.InteractRequest()
-                request.close.session_id = self.session_id
-                self.exchange.timeout = timeout
-                self.exchange.send(request)
-                self.exchange.receive()
-            else:
-                request = _wire.env.CloseSessionRequest(session_id=self.session_id)
-                self.transport.unary("CloseSession", request, timeout=timeout)
+            self.link.close(timeout)
         self.transport.close()
 
 
 class Session:
-    """A batch of environments on the server, by the wire's own messages."""
+    """A batch of environments on the server."""
 
     def __init__(
         self,
@@ -78,6 +81,7 @@ class Session:
         action_masks: bool = False,
         timeout: float = DEFAULT_TIMEOUT_SECS,
         lease_secs: float | None = None,
+        client: str = "auto",
     ) -> None:
         """Keeps what the session is made from; nothing is sent.
 
@@ -87,11 +91,15 @@ class Session:
             raise InvalidArgumentError(f"timeout: expected seconds above 0, got {timeout!r}", field="timeout")
         if num_envs < 1:
             raise InvalidArgumentError(f"num_envs: expected at least 1, got {num_envs!r}", field="num_envs")
+        choose(client)
         self.address = address
+        self.client = client
         self.timeout = timeout
         self.num_envs = num_envs
         #: True from the first seeded reset on: the server's generators may then go on by themselves.
         self.seeded = False
+        #: Steps that were sent and not received.
+        self.pending = 0
         #: True where a step makes sense.
         self.started = False
         self.spec: Any = None
@@ -118,7 +126,7 @@ class Session:
     def __getstate__(self) -> dict[str, Any]:
         """Everything but the connection, which belongs to this process."""
         state = self.__dict__.copy()
-        state.update(_connection=None, _finalizer=None, seeded=False, started=False)
+        state.update(_connection=None, _finalizer=None, seeded=False, started=False, pending=0)
         for key in ("_create", "spec"):
             message = state[key]
             state[key] = None if message is None else message.SerializeToString()
@@ -136,47 +144,125 @@ class Session:
         self._ensure()
         return self.spec
 
-    def reset(self, *, seed: int | None, seeds: bytes, mask: bytes, draw: Callable[[], int]) -> Any:
-        """Begins episodes; returns a `ResetResponse`.
+    def reset(
+        self,
+        *,
+        seed: int | None,
+        seeds: Sequence[int] | None = None,
+        mask: npt.NDArray[np.bool_] | None = None,
+        draw: Callable[[], int],
+    ) -> First:
+        """Begins episodes; returns observations and info columns.
 
         Args:
             seed: Environment i is seeded with seed + i; None lets the generators go on.
-            seeds: A packed seed each instead; empty for none.
-            mask: Packed flags of the environments meant; empty for all.
+            seeds: A seed each instead.
+            mask: Which environments are meant; None is all.
             draw: Gives the seed for generators that were never seeded.
         """
+        return self._begin(
+            lambda link, first: link.reset(first, seeds, mask),
+            seed=seed,
+            draw=None if seeds else draw,
+            whole=mask is None,
+        )
+
+    def reset_one(self, *, seed: int | None, draw: Callable[[], int]) -> tuple[Any, dict[str, Any]]:
+        """As `reset` in a session of one environment: its observation and info."""
+        return self._begin(lambda link, first: link.reset_one(first), seed=seed, draw=draw, whole=True)
+
+    def _begin(
+        self,
+        begin: Callable[[Link, int | None], T],
+        *,
+        seed: int | None,
+        draw: Callable[[], int] | None,
+        whole: bool,
+    ) -> T:
         for attempt in (0, 1):
             fresh = self._ensure()
-            first = None if seed is not None or seeds or self.seeded else draw()
-            request = _wire.env.InteractRequest()
-            reset = request.reset
-            reset.SetInParent()
-            if seeds:
-                reset.seeds = seeds
-            elif seed is not None or first is not None:
-                reset.seed = seed if seed is not None else first
-            reset.reset_mask = mask
+            self._refuse_pending("reset")
+            first = draw() if seed is None and draw is not None and not self.seeded else seed
+            assert self._connection is not None
             try:
-                response = self._exchange(request).reset
-            except (SessionLostError, ServerUnreachableError):
+                begun = begin(self._connection.link, first)
+            except BaseException as error:  # noqa: BLE001 - raised as what it means
+                failure = self._failed(error)
                 # A session that was lost since its last use is made anew, once; part of a batch
                 # cannot be, for the other part is gone.
-                if fresh or attempt or mask:
-                    raise
-                continue
+                lost = isinstance(failure, (SessionLostError, ServerUnreachableError))
+                if lost and whole and not fresh and not attempt:
+                    continue
+                raise failure from None
             self.seeded = True
             self.started = True
-            return response
+            return begun
         raise AssertionError("unreachable")
 
-    def step(self, actions: bytes) -> Any:
-        """Steps every environment; returns a `StepResponse`."""
-        if not self.started or self._connection is None or self._connection.pid != os.getpid():
+    def step(self, actions: Any) -> Stepped:
+        """Steps every environment."""
+        link = self._under_way("step")
+        self._refuse_pending("step")
+        try:
+            return link.step(_arrays.integers(actions, (self.num_envs,), "actions"))
+        except BaseException as error:  # noqa: BLE001 - raised as what it means
+            raise self._failed(error) from None
+
+    def step_one(self, action: Any) -> SteppedOne:
+        """As `step` in a session of one environment."""
+        link = self._under_way("step")
+        try:
+            stepped = link.step_one(action)
+            if stepped is None and isinstance(action, np.ndarray) and action.size == 1:
+                stepped = link.step_one(action.item())
+        except BaseException as error:  # noqa: BLE001 - raised as what it means
+            raise self._failed(error) from None
+        if stepped is None:
+            last = self.spec.n_actions - 1
+            raise InvalidArgumentError(
+                f"actions: expected an integer from 0 to {last}, got {action!r}", field="actions"
+            )
+        return stepped
+
+    def send(self, actions: Any) -> None:
+        """Sends actions; `receive` brings what came of them, in order."""
+        link = self._under_way("send")
+        if self.pending >= MAX_PENDING:
+            raise WrongStateError(
+                f"expected at most {MAX_PENDING} steps that are sent and not received", hint="call recv()"
+            )
+        try:
+            link.send(_arrays.integers(actions, (self.num_envs,), "actions"))
+        except InvalidArgumentError:
+            raise  # nothing was sent
+        except BaseException as error:  # noqa: BLE001 - raised as what it means
+            raise self._failed(error) from None
+        self.pending += 1
+
+    def receive(self) -> Stepped:
+        """What came of the oldest actions that were sent and not yet received."""
+        link = self._under_way("recv")
+        if not self.pending:
+            raise WrongStateError("cannot receive what was not sent", hint="call send() first")
+        self.pending -= 1
+        try:
+            return link.receive()
+        except BaseException as error:  # noqa: BLE001 - raised as what it means
+            raise self._failed(error) from None
+
+    def _under_way(self, what: str) -> Link:
+        """The link, where an episode goes on."""
+        connection = self._connection
+        if not self.started or connection is None or connection.pid != os.getpid():
             self._refuse_closed()
-            raise ResetNeededError("cannot step before the first reset", hint="call reset() first")
-        request = _wire.env.InteractRequest()
-        request.step.actions = actions
-        return self._exchange(request).step
+            raise ResetNeededError(f"cannot {what} before the first reset", hint="call reset() first")
+        return connection.link
+
+    def _refuse_pending(self, what: str) -> None:
+        if self.pending:
+            raise WrongStateError(
+                f"cannot {what} with {self.pending} steps sent and not received", hint="call recv() first"
+            )
 
     def render(self, index: int, mode: str) -> Any:
         """Draws one environment; returns a `RenderResponse`."""
@@ -189,8 +275,10 @@ class Session:
             index=index,
             mode=_wire.env.RenderMode[f"RENDER_MODE_{mode.upper()}"],
         )
-        with self._watched():
+        try:
             return connection.transport.unary("Render", request, timeout=self.timeout)
+        except MazewayError as error:
+            raise self._failed(error) from None
 
     def close(self) -> None:
         """Ends the session; may be called twice, and with the server gone."""
@@ -208,14 +296,15 @@ class Session:
             if self._connection.pid == os.getpid():
                 return False
             self._drop()
-        transport = connect(self.address, _wire.ENVIRONMENT_SERVICE)
+        transport = connect(self.address, _wire.ENVIRONMENT_SERVICE, self.client)
         try:
             response = transport.unary("CreateSession", self._create, timeout=self.timeout)
+            link = make_link(transport, response, self.timeout)
         except BaseException:
             transport.close()
             raise
         self.spec = response.spec
-        self._connection = _Connection(transport, response.session_id, self.timeout, os.getpid())
+        self._connection = _Connection(transport, link, response.session_id, self.timeout, os.getpid())
         self._finalizer = weakref.finalize(self, self._connection.release)
         return True
 
@@ -223,44 +312,25 @@ class Session:
         """Forgets the connection, closing what can be closed."""
         self._connection = None
         self.seeded = self.started = False
+        self.pending = 0
         if self._finalizer is not None:
             self._finalizer()
             self._finalizer = None
 
-    def _exchange(self, request: Any) -> Any:
-        """Sends one request on the fast path and waits for its answer."""
-        connection = self._connection
-        assert connection is not None
-        with self._watched():
-            if connection.exchange is None or not connection.exchange.alive:
-                connection.exchange = connection.transport.exchange("Interact", timeout=self.timeout)
-                getattr(request, request.WhichOneof("request")).session_id = connection.session_id
-            try:
-                connection.exchange.send(request)
-                return connection.exchange.receive()
-            except MazewayError:
-                raise  # the stream is over; the session lives on and the next stream takes it up
-            except BaseException:
-                # Interrupted between request and answer: the episode's state is unknown.
-                self.started = False
-                raise
-
-    @contextlib.contextmanager
-    def _watched(self) -> Any:
-        """Turns the loss of the session into its own error and forgets the connection."""
-        try:
-            yield
-        except ServerUnreachableError:
+    def _failed(self, error: BaseException) -> BaseException:
+        """Takes note of a failure; returns the error to raise."""
+        self.pending = 0  # whatever was under way went with the stream
+        if isinstance(error, ServerUnreachableError):
             self._drop()
-            raise
-        except NotFoundError as error:
+        elif isinstance(error, (NotFoundError, DeadlineExceededError)):
             self._drop()
-            raise _lost(error) from None
-        except DeadlineExceededError as error:
-            self._drop()
-            if error.hint:  # our own deadline
-                raise
-            raise _lost(error) from None
+            if not error.hint:  # not our own deadline
+                return _lost(error)
+        elif not isinstance(error, MazewayError):
+            # Interrupted between request and answer: the episode's state is unknown.
+            self.started = False
+        # Else the stream is over; the session lives on and the next stream takes it up.
+        return error
 
 
 def _lost(error: MazewayError) -> SessionLostError:

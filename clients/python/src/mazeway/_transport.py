@@ -1,35 +1,20 @@
-"""How calls travel. `Transport` is the contract; `GrpcTransport` keeps it with grpcio.
+"""How calls travel. `Transport` is the contract, which two clients keep; `connect` chooses.
 
-Everything above this module speaks of messages, methods and `MazewayError`s, and nothing of gRPC, so
-another transport can take this one's place (`connect` chooses). Invariants: every call ends, by an
-answer or by a `MazewayError`, within its timeout; a transport works on both sides of a fork.
-
-gRPC's core survives a fork only if nothing of it is at work at that moment. So every transport lets its
-channel go before a fork and connects again, in parent and child alike, with the next call.
+The native one (`_native_transport`) is Rust's client in a compiled module, the other (`_grpc`) needs
+grpcio and no compiler. Everything above this module speaks of messages, methods and `MazewayError`s, and
+nothing of gRPC. Invariants: every call ends, by an answer or by a `MazewayError`, within its timeout; a
+transport works on both sides of a fork.
 """
 
 from __future__ import annotations
 
-import contextlib
+import importlib.util
 import os
-import threading
-import time
-import weakref
-from collections.abc import Callable, Iterable, Iterator
-from queue import SimpleQueue
+from collections.abc import Iterable, Iterator
 from typing import Any, Protocol
 
-import grpc
-
 from mazeway import _wire
-from mazeway.errors import (
-    DeadlineExceededError,
-    InvalidArgumentError,
-    MazewayError,
-    ServerFailureError,
-    ServerUnreachableError,
-    from_rpc_error,
-)
+from mazeway.errors import DeadlineExceededError, InvalidArgumentError, UnsupportedError
 
 #: The command that starts each service, for hints.
 START = {
@@ -40,11 +25,11 @@ START = {
 #: Longest message either way; a batch or a frame beyond it is refused rather than held.
 MAX_MESSAGE_BYTES = 256 * 1024 * 1024
 
-#: How long a fork waits for a call that another thread is making.
-_FORK_WAIT_SECS = 5.0
+#: What `client` may be. "auto" is the native client where it is built and knows the kind of address.
+CLIENTS = ("auto", "native", "grpc")
 
-#: gRPC's own threads finish with a closed channel in the background; a fork comes so long after it.
-_FORK_REST_SECS = 0.05
+#: Names the client that "auto" stands for.
+CLIENT_VARIABLE = "MAZEWAY_CLIENT"
 
 
 class Exchange(Protocol):
@@ -87,12 +72,53 @@ class Transport(Protocol):
         """Frees the connection; may be called twice."""
 
 
-def connect(address: str, service: str) -> Transport:
-    """A transport to `address`; connects with the first call."""
-    return GrpcTransport(address, service)
+def connect(address: str, service: str, client: str = "auto") -> Transport:
+    """A transport to `address`; connects with the first call.
+
+    Raises InvalidArgumentError for no address or no such client, UnsupportedError for a client that is
+    not there.
+    """
+    target, secure = check_address(address)
+    if choose(client, secure=secure) == "native":
+        from mazeway._native_transport import NativeTransport  # there may be none
+
+        return NativeTransport(target, service)
+    from mazeway._grpc import GrpcTransport  # the native client needs no grpcio
+
+    return GrpcTransport(target, service, secure=secure)
 
 
-def _target(address: str) -> tuple[str, bool]:
+def choose(client: str, *, secure: bool = False) -> str:
+    """The client that is meant: "native" or "grpc"."""
+    if client not in CLIENTS:
+        names = ", ".join(map(repr, CLIENTS))
+        raise InvalidArgumentError(f"client: expected one of {names}, got {client!r}", field="client")
+    if client == "auto":
+        client = os.environ.get(CLIENT_VARIABLE, "") or "auto"
+        if client not in CLIENTS:
+            names = ", ".join(map(repr, CLIENTS))
+            raise InvalidArgumentError(
+                f"{CLIENT_VARIABLE}: expected one of {names}, got {client!r}", field="client"
+            )
+    native = has_native()
+    if client == "auto":
+        return "native" if native and not secure else "grpc"
+    if client == "native" and not native:
+        raise UnsupportedError(
+            "the native client is not built",
+            hint="pip install ./clients/python with a Rust toolchain at hand, or take client='grpc'",
+        )
+    if client == "native" and secure:
+        raise UnsupportedError("the native client has no TLS", hint="take client='grpc'")
+    return client
+
+
+def has_native() -> bool:
+    """Whether the native client is built."""
+    return importlib.util.find_spec("mazeway._native") is not None
+
+
+def check_address(address: str) -> tuple[str, bool]:
     """Host and port, and whether to use TLS; raises InvalidArgumentError for no address."""
     if not isinstance(address, str):
         raise InvalidArgumentError(
@@ -110,286 +136,9 @@ def _target(address: str) -> tuple[str, bool]:
     return target, secure
 
 
-class GrpcTransport:
-    """The transport over grpcio."""
-
-    def __init__(self, address: str, service: str) -> None:
-        """Takes the address ("host:port", "http://…" or, for TLS, "https://…")."""
-        target, secure = _target(address)
-        self.address = address
-        self.service = service
-        self._methods = _wire.services[service]
-        options: list[tuple[str, int]] = [
-            ("grpc.max_receive_message_length", MAX_MESSAGE_BYTES),
-            ("grpc.max_send_message_length", MAX_MESSAGE_BYTES),
-            # A new transport to a server that came back must not inherit another's waiting time.
-            ("grpc.use_local_subchannel_pool", 1),
-            ("grpc.initial_reconnect_backoff_ms", 100),
-            ("grpc.max_reconnect_backoff_ms", 1000),
-        ]
-        if target.rpartition(":")[0] in ("127.0.0.1", "localhost", "[::1]"):
-            options.append(("grpc.enable_http_proxy", 0))
-        self._target, self._secure, self._options = target, secure, options
-        self._channel: Any = None
-        self._callables: dict[str, Callable[..., Any]] = {}
-        self._exchanges: weakref.WeakSet[_GrpcExchange] = weakref.WeakSet()
-        #: Held during a call, so that no fork comes between. Reentrant, for the garbage collector may
-        #: close a forgotten environment at any point, also while this thread holds it for a fork.
-        self._lock = threading.RLock()
-        #: Calls whose messages the caller's own code makes or takes: a fork cannot wait for them.
-        self._streaming = 0
-        self._paused = False
-        _forks.add(self)
-
-    def unary(self, method: str, request: Any, *, timeout: float) -> Any:
-        """See `Transport`."""
-        with self._translated(timeout), self._lock:
-            return self._callable(method)(request, timeout=timeout)
-
-    def responses(self, method: str, request: Any, *, timeout: float) -> Iterator[Any]:
-        """See `Transport`."""
-        with self._translated(timeout), self._counted():
-            with self._lock:
-                call = self._callable(method)(request, timeout=timeout)
-            try:
-                yield from call
-            finally:
-                call.cancel()
-
-    def requests(self, method: str, requests: Iterable[Any], *, timeout: float) -> Any:
-        """See `Transport`."""
-        with self._translated(timeout), self._counted():
-            with self._lock:
-                call = self._callable(method)
-            return call(iter(requests), timeout=timeout)
-
-    def exchange(self, method: str, *, timeout: float) -> Exchange:
-        """See `Transport`."""
-        with self._lock:
-            exchange = _GrpcExchange(self, self._callable(method), timeout, self._lock)
-            self._exchanges.add(exchange)
-            return exchange
-
-    def close(self) -> None:
-        """See `Transport`."""
-        with self._lock:
-            self._disconnect()
-
-    def pause(self) -> None:
-        """Lets the channel go for a fork; calls wait for `resume`."""
-        self._paused = self._lock.acquire(timeout=_FORK_WAIT_SECS)
-        if self._paused and not self._streaming:
-            self._disconnect()
-
-    def resume(self) -> None:
-        """The fork is over."""
-        if self._paused:
-            self._paused = False
-            self._lock.release()
-
-    def _disconnect(self) -> None:
-        """Closes the channel and ends its streams; the caller holds the lock."""
-        for exchange in list(self._exchanges):
-            exchange.cancel()
-        self._exchanges.clear()
-        self._callables.clear()
-        if self._channel is not None:
-            self._channel.close()
-            self._channel = None
-            _forks.closed()
-
-    @contextlib.contextmanager
-    def _counted(self) -> Iterator[None]:
-        self._streaming += 1
-        try:
-            yield
-        finally:
-            self._streaming -= 1
-
-    def translate(self, error: grpc.RpcError, timeout: float) -> MazewayError:
-        """The `MazewayError` that says what `error` says."""
-        if error.code() is grpc.StatusCode.DEADLINE_EXCEEDED and _is_local_deadline(error):
-            return _late(self.address, timeout)
-        return from_rpc_error(error, address=self.address, start=START[self.service])
-
-    @contextlib.contextmanager
-    def _translated(self, timeout: float) -> Iterator[None]:
-        try:
-            yield
-        except grpc.RpcError as error:
-            raise self.translate(error, timeout) from None
-        except ValueError as error:  # grpcio's word for a closed channel
-            raise ServerUnreachableError(f"the connection to {self.address} is closed ({error})") from None
-
-    def _callable(self, name: str) -> Callable[..., Any]:
-        if self._channel is None:
-            self._channel = (
-                grpc.secure_channel(self._target, grpc.ssl_channel_credentials(), self._options)
-                if self._secure
-                else grpc.insecure_channel(self._target, self._options)
-            )
-        if name not in self._callables:
-            method = self._methods[name]
-            kind = ("stream" if method.client_streaming else "unary") + (
-                "_stream" if method.server_streaming else "_unary"
-            )
-            self._callables[name] = getattr(self._channel, kind)(
-                method.path,
-                request_serializer=method.request.SerializeToString,
-                response_deserializer=method.response.FromString,
-            )
-        return self._callables[name]
-
-
-def _is_local_deadline(error: grpc.RpcError) -> bool:
-    """Whether the deadline passed here rather than by the server's word about a lease."""
-    return "Deadline Exceeded" in (error.details() or "Deadline Exceeded")
-
-
-def _late(address: str, timeout: float) -> DeadlineExceededError:
+def late(address: str, timeout: float) -> DeadlineExceededError:
+    """The error of a call whose answer did not come within the client's own timeout."""
     return DeadlineExceededError(
         f"no answer from {address} within {timeout:g} s",
         hint="raise `timeout`, or see whether the server is busy",
-    )
-
-
-class _GrpcExchange:
-    """A bidirectional stream over grpcio with a deadline on each answer.
-
-    A gRPC deadline covers a whole stream and grpcio's iterator waits for ever, so the watchdog thread
-    cancels the call when an answer is late.
-    """
-
-    def __init__(
-        self,
-        transport: GrpcTransport,
-        method: Callable[..., Any],
-        timeout: float,
-        lock: contextlib.AbstractContextManager[Any],
-    ) -> None:
-        self._transport = transport
-        self._lock = lock
-        self.alive = True
-        self._requests: SimpleQueue[Any] = SimpleQueue()
-        self._call = method(iter(self._requests.get, None))
-        self.timeout = timeout
-        self.waiting_since: float | None = None
-        self.expired = False
-        _watchdog.watch(self)
-
-    def send(self, request: Any) -> None:
-        self._requests.put(request)
-
-    def receive(self) -> Any:
-        with self._lock:
-            return self._receive()
-
-    def _receive(self) -> Any:
-        self.waiting_since = time.monotonic()
-        answer = None
-        try:
-            answer = next(self._call)
-        except StopIteration:
-            raise ServerFailureError(
-                f"the server at {self._transport.address} ended the stream without an answer"
-            ) from None
-        except grpc.RpcError as error:
-            if self.expired:
-                raise _late(self._transport.address, self.timeout) from None
-            raise self._transport.translate(error, self.timeout) from None
-        finally:
-            self.waiting_since = None
-            if answer is None:  # also by a KeyboardInterrupt, after which answers are out of step
-                self.cancel()
-        return answer
-
-    def cancel(self) -> None:
-        self.alive = False
-        self._requests.put(None)  # ends the request iterator and so grpcio's thread
-        self._call.cancel()
-
-
-class _Watchdog:
-    """One daemon thread a process that cancels exchanges whose answer is late."""
-
-    def __init__(self) -> None:
-        self.forget()
-
-    def forget(self) -> None:
-        """Starts afresh, as a forked child must: the thread and the calls are its parent's."""
-        self._exchanges: weakref.WeakSet[_GrpcExchange] = weakref.WeakSet()
-        self._lock = threading.Lock()
-        self._thread: threading.Thread | None = None
-        self._wake = threading.Event()
-
-    def watch(self, exchange: _GrpcExchange) -> None:
-        with self._lock:
-            self._exchanges.add(exchange)
-            if self._thread is None:
-                self._thread = threading.Thread(target=self._run, name="mazeway-watchdog", daemon=True)
-                self._thread.start()
-        self._wake.set()
-
-    def _run(self) -> None:
-        while True:
-            with self._lock:
-                exchanges = list(self._exchanges)
-                if not exchanges:
-                    self._thread = None
-                    return
-            now = time.monotonic()
-            period = 1.0
-            for exchange in exchanges:
-                period = min(period, max(exchange.timeout / 4, 0.005))
-                since = exchange.waiting_since
-                if since is not None and now - since > exchange.timeout:
-                    exchange.expired = True
-                    exchange.cancel()
-            del exchange, exchanges  # hold no exchange while asleep
-            self._wake.wait(period)
-            self._wake.clear()
-
-
-class _Forks:
-    """All transports of this process, paused while it forks."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._transports: weakref.WeakSet[GrpcTransport] = weakref.WeakSet()
-        self._paused: list[GrpcTransport] = []
-        self._last_close: float | None = None
-
-    def closed(self) -> None:
-        self._last_close = time.monotonic()
-
-    def add(self, transport: GrpcTransport) -> None:
-        with self._lock:
-            self._transports.add(transport)
-
-    def before(self) -> None:
-        self._lock.acquire()
-        self._paused = list(self._transports)
-        for transport in self._paused:
-            transport.pause()
-        if self._last_close is not None:
-            time.sleep(max(0.0, self._last_close + _FORK_REST_SECS - time.monotonic()))
-
-    def after_in_parent(self) -> None:
-        for transport in self._paused:
-            transport.resume()
-        self._paused = []
-        self._lock.release()
-
-    def after_in_child(self) -> None:
-        _watchdog.forget()
-        self.after_in_parent()
-
-
-_watchdog = _Watchdog()
-_forks = _Forks()
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(
-        before=_forks.before,
-        after_in_parent=_forks.after_in_parent,
-        after_in_child=_forks.after_in_child,
     )

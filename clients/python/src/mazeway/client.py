@@ -108,11 +108,21 @@ class Rollout:
 class Client:
     """Speaks with the environment server at `address`."""
 
-    def __init__(self, address: str = DEFAULT_ADDRESS, *, timeout: float = DEFAULT_TIMEOUT_SECS) -> None:
-        """Takes "host:port" and the longest wait for a call, in seconds."""
+    def __init__(
+        self,
+        address: str = DEFAULT_ADDRESS,
+        *,
+        timeout: float = DEFAULT_TIMEOUT_SECS,
+        client: str = "auto",
+    ) -> None:
+        """Takes "host:port", the longest wait for a call in seconds, and which client to use.
+
+        `client` is "native", "grpc", or "auto" for the native one where it is built.
+        """
         self.address = address
         self.timeout = timeout
-        self._transport = connect(address, _wire.ENVIRONMENT_SERVICE)
+        self.client = client
+        self._transport = connect(address, _wire.ENVIRONMENT_SERVICE, client)
 
     def __enter__(self) -> Client:
         """Itself."""
@@ -230,7 +240,7 @@ class Client:
 
     def _sizes(self, env_id: str, options: Mapping[str, Any]) -> tuple[int, int]:
         """States and actions under the options, which may change them (a maze's layout does)."""
-        session = Session(self.address, env_id, dict(options), timeout=self.timeout)
+        session = Session(self.address, env_id, dict(options), timeout=self.timeout, client=self.client)
         try:
             spec = session.open()
             return spec.n_states, spec.n_actions

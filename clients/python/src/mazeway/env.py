@@ -78,6 +78,7 @@ class MazewayEnv(gymnasium.Env[Any, Any]):
         action_masks: bool = False,
         timeout: float = DEFAULT_TIMEOUT_SECS,
         lease_secs: float | None = None,
+        client: str = "auto",
         **options: Any,
     ) -> None:
         """Describes the environment; nothing is sent yet.
@@ -91,6 +92,7 @@ class MazewayEnv(gymnasium.Env[Any, Any]):
             action_masks: True adds `info["action_mask"]`, an int8 array for `action_space.sample`.
             timeout: Longest wait for any answer, in seconds.
             lease_secs: How long the session outlives its last use; None is the server's default.
+            client: "native", "grpc", or "auto" for the native one where it is built.
             **options: The environment's own options (see `mazeway.Client.list_environments`).
         """
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
@@ -100,6 +102,7 @@ class MazewayEnv(gymnasium.Env[Any, Any]):
             )
         self.env_id = server_env_id(env_id)
         self.address = address
+        self.client = client
         self.options = options
         self.render_mode = render_mode
         self._session = Session(
@@ -110,10 +113,10 @@ class MazewayEnv(gymnasium.Env[Any, Any]):
             action_masks=action_masks,
             timeout=timeout,
             lease_secs=lease_secs,
+            client=client,
         )
         self._observation_space: gymnasium.Space[Any] | None = None
         self._action_space: gymnasium.spaces.Discrete | None = None
-        self._columns: list[_arrays.Column] = []
 
     @property
     def observation_space(self) -> gymnasium.Space[Any]:  # type: ignore[override]
@@ -138,19 +141,11 @@ class MazewayEnv(gymnasium.Env[Any, Any]):
             seed = check_seed(seed)
         super().reset(seed=seed)
         self._describe()
-        response = self._session.reset(seed=seed, seeds=b"", mask=b"", draw=self._draw_seed)
-        return self._observation(response.observations), self._info(response.infos)
+        return self._session.reset_one(seed=seed, draw=self._draw_seed)
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """Takes one action; returns observation, reward, terminated, truncated and info."""
-        response = self._session.step(self._pack_action(action))
-        return (
-            self._observation(response.observations),
-            float(np.frombuffer(response.rewards, _arrays.FLOAT64)[0]),
-            response.terminated != b"\0",
-            response.truncated != b"\0",
-            self._info(response.infos),
-        )
+        return self._session.step_one(action)
 
     def render(self) -> str | npt.NDArray[np.uint8] | None:  # type: ignore[override]
         """Draws the present state: text, or an array of shape (height, width, 3)."""
@@ -172,38 +167,11 @@ class MazewayEnv(gymnasium.Env[Any, Any]):
             spec = self._session.open()
             self._action_space = action_space(spec)
             self._observation_space = _arrays.space_from_wire(spec.observation_space)
-            self._columns = [_arrays.Column.from_wire(c) for c in spec.info_columns]
             if spec.render_fps:
                 self.metadata = {**self.metadata, "render_fps": spec.render_fps}
 
     def _draw_seed(self) -> int:
         return int(self.np_random.integers(2**63))
-
-    def _pack_action(self, action: Any) -> bytes:
-        assert self._action_space is not None or not self._session.started
-        n = self._action_space.n if self._action_space is not None else 0
-        try:
-            value = operator.index(action.item() if isinstance(action, np.ndarray) else action)
-        except (TypeError, ValueError):
-            value = -1
-        if self._session.started and not 0 <= value < n:
-            raise InvalidArgumentError(
-                f"actions: expected an integer from 0 to {n - 1}, got {action!r}", field="actions"
-            )
-        return value.to_bytes(4, "little", signed=True)
-
-    def _observation(self, data: bytes) -> Any:
-        spec = self._session.spec.observation_space
-        dtype = _arrays.space_dtype(spec)
-        space = self._observation_space
-        if isinstance(space, gymnasium.spaces.Discrete):
-            return np.int64(_arrays.unpack(data, dtype, (1,), "observations")[0])
-        assert space is not None
-        assert space.shape is not None
-        return _arrays.unpack(data, dtype, space.shape, "observations")
-
-    def _info(self, infos: Any) -> dict[str, Any]:
-        return {column.name: column.single(data) for column, data in zip(self._columns, infos, strict=True)}
 
 
 def action_space(spec: Any) -> gymnasium.spaces.Discrete:

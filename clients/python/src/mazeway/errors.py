@@ -6,12 +6,10 @@ argument is also a `ValueError`, an absent server also a `ConnectionError`.
 
 from __future__ import annotations
 
-from typing import Any
+import re
+from collections.abc import Sequence
 
-import grpc
 import gymnasium
-
-from mazeway import _wire
 
 
 class MazewayError(Exception):
@@ -92,61 +90,76 @@ class ServerFailureError(MazewayError):
     """The server failed; this is a defect of the server, not of the call."""
 
 
-_BY_CODE: dict[grpc.StatusCode, type[MazewayError]] = {
-    grpc.StatusCode.UNAVAILABLE: ServerUnreachableError,
-    grpc.StatusCode.DEADLINE_EXCEEDED: DeadlineExceededError,
-    grpc.StatusCode.INVALID_ARGUMENT: InvalidArgumentError,
-    grpc.StatusCode.OUT_OF_RANGE: InvalidArgumentError,
-    grpc.StatusCode.NOT_FOUND: NotFoundError,
-    grpc.StatusCode.ALREADY_EXISTS: AlreadyExistsError,
-    grpc.StatusCode.FAILED_PRECONDITION: WrongStateError,
-    grpc.StatusCode.RESOURCE_EXHAUSTED: LimitReachedError,
-    grpc.StatusCode.CANCELLED: CancelledError,
-    grpc.StatusCode.UNIMPLEMENTED: UnsupportedError,
+#: gRPC's status codes by number.
+_CODES = (
+    "ok",
+    "cancelled",
+    "unknown",
+    "invalid argument",
+    "deadline exceeded",
+    "not found",
+    "already exists",
+    "permission denied",
+    "resource exhausted",
+    "failed precondition",
+    "aborted",
+    "out of range",
+    "unimplemented",
+    "internal",
+    "unavailable",
+    "data loss",
+    "unauthenticated",
+)
+
+_KINDS: dict[str, type[MazewayError]] = {
+    "cancelled": CancelledError,
+    "invalid argument": InvalidArgumentError,
+    "deadline exceeded": DeadlineExceededError,
+    "not found": NotFoundError,
+    "already exists": AlreadyExistsError,
+    "resource exhausted": LimitReachedError,
+    "failed precondition": WrongStateError,
+    "out of range": InvalidArgumentError,
 }
 
-
-def _violations(error: grpc.RpcError) -> list[tuple[str, str]]:
-    """Field and description of each google.rpc.BadRequest violation in the trailers."""
-    metadata: Any = error.trailing_metadata() or ()
-    for key, value in metadata:
-        if key == "grpc-status-details-bin":
-            return [
-                (violation.field, violation.description)
-                for detail in _wire.status.Status.FromString(value).details
-                if detail.type_url.endswith("/google.rpc.BadRequest")
-                for violation in _wire.status.BadRequest.FromString(detail.value).field_violations
-            ]
-    return []
+#: How the operating system's number of an error is added to its words by some.
+_OS_ERROR = re.compile(r" \(os error \d+\)$")
 
 
-def from_rpc_error(error: grpc.RpcError, *, address: str, start: str) -> MazewayError:
+def from_status(
+    code: int,
+    details: str,
+    violations: Sequence[tuple[str, str]],
+    *,
+    address: str,
+    start: str,
+) -> MazewayError:
     """Translates a failed call.
 
     Args:
-        error: What grpcio raised.
+        code: gRPC's status code.
+        details: What the server says, or what happened to the connection.
+        violations: Field and description of each violation that the server names.
         address: Where the call went.
         start: The command that starts such a server, for the hint.
     """
-    code = error.code()
-    details = " ".join((error.details() or code.name.lower().replace("_", " ")).split())
-    if code is grpc.StatusCode.UNAVAILABLE:
-        cause = details.rpartition(": ")[2].lower()  # grpcio prefixes every layer it went through
+    name = _CODES[code] if 0 <= code < len(_CODES) else str(code)
+    details = " ".join(details.split())
+    if name == "unavailable":
+        # Every layer that an error went through puts its own words before it.
+        cause = _OS_ERROR.sub("", details.rpartition(": ")[2]).lower()
         return ServerUnreachableError(
             f"no server answers at {address} ({cause})", hint=f"start one with: {start}"
         )
-    if code is grpc.StatusCode.UNIMPLEMENTED:
+    if name == "unimplemented":
         return UnsupportedError(
             f"the server at {address} does not know this method ({details})",
             hint=f"check that the address is right and the server current: {start}",
         )
-    kind = _BY_CODE.get(code, ServerFailureError)
-    if kind is ServerFailureError:
-        return ServerFailureError(
-            f"the server at {address} failed: {code.name.lower().replace('_', ' ')}: {details}"
-        )
+    kind = _KINDS.get(name)
+    if kind is None:
+        return ServerFailureError(f"the server at {address} failed: {name}: {details}")
     if kind is InvalidArgumentError:
-        violations = _violations(error)
         field = violations[0][0] if violations else ""
         named = details if field.rpartition(".")[2] in details else f"{field}: {details}"
         further = [f"{f}: {d}" for f, d in violations[1:]]

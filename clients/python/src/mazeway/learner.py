@@ -26,12 +26,19 @@ class Learner:
     """Speaks with the learner service at `address`."""
 
     def __init__(
-        self, address: str = DEFAULT_LEARNER_ADDRESS, *, timeout: float = DEFAULT_TIMEOUT_SECS
+        self,
+        address: str = DEFAULT_LEARNER_ADDRESS,
+        *,
+        timeout: float = DEFAULT_TIMEOUT_SECS,
+        client: str = "auto",
     ) -> None:
-        """Takes "host:port" and the longest wait for a call other than `fit`, in seconds."""
+        """Takes "host:port", the longest wait for a call other than `fit` in seconds, and a client.
+
+        `client` is "native", "grpc", or "auto" for the native one where it is built.
+        """
         self.address = address
         self.timeout = timeout
-        self._transport = connect(address, _wire.LEARNER_SERVICE)
+        self._transport = connect(address, _wire.LEARNER_SERVICE, client)
 
     def __enter__(self) -> Learner:
         """Itself."""

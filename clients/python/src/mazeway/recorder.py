@@ -49,6 +49,7 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordCons
         *,
         source: str = "python",
         timeout: float = DEFAULT_TIMEOUT_SECS,
+        client: str = "auto",
     ) -> None:
         """Wraps an environment; nothing is sent yet.
 
@@ -62,6 +63,7 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordCons
                 the learner. None: none.
             source: Who acts.
             timeout: Longest wait for the learner, in seconds.
+            client: "native", "grpc", or "auto" for the native one where it is built.
         """
         gymnasium.utils.RecordConstructorArgs.__init__(
             self,
@@ -71,6 +73,7 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordCons
             model_id=model_id,
             source=source,
             timeout=timeout,
+            client=client,
         )
         gymnasium.Wrapper.__init__(self, env)
         observations: Any = env.observation_space
@@ -89,8 +92,9 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordCons
         self.source = source
         self._n_states, self._first_state = int(observations.n), int(observations.start)
         self._n_actions, self._first_action = int(actions.n), int(actions.start)
-        self._uploader = _Uploader(address, timeout)
+        self._uploader = _Uploader(address, timeout, client)
         self._timeout = timeout
+        self._client = client
         self._forget()
 
     @property
@@ -170,7 +174,7 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordCons
         inner = self.env.unwrapped
         parts: Any
         if isinstance(inner, MazewayEnv):
-            client = Client(inner.address, timeout=self._timeout)
+            client = Client(inner.address, timeout=self._timeout, client=inner.client)
             parts = client.model_parts(inner.env_id, inner.options)
         elif isinstance(getattr(inner, "P", None), dict):
             client = None
@@ -180,7 +184,9 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordCons
         with contextlib.ExitStack() as stack:
             if client is not None:
                 stack.callback(client.close)
-            learner = stack.enter_context(Learner(self.learner_address, timeout=self._timeout))
+            learner = stack.enter_context(
+                Learner(self.learner_address, timeout=self._timeout, client=self._client)
+            )
             return learner.put_model_parts(list(parts))
 
 
@@ -195,8 +201,9 @@ def _env_id(env: gymnasium.Env[Any, Any]) -> str:
 class _Uploader:
     """Sends trajectories over one stream, and again over another where that breaks."""
 
-    def __init__(self, address: str, timeout: float) -> None:
+    def __init__(self, address: str, timeout: float, client: str) -> None:
         self._address = address
+        self._client = client
         self._timeout = timeout
         #: Not acknowledged, in the order of sending; the learner knows a repeated id.
         self.pending: dict[str, Trajectory] = {}
@@ -259,7 +266,7 @@ class _Uploader:
         """Waits for the answers of the present stream, or opens one and sends all that is pending."""
         if self._exchange is None or not self._exchange.alive or self._pid != os.getpid():
             self.close()
-            self._transport = connect(self._address, _wire.LEARNER_SERVICE)
+            self._transport = connect(self._address, _wire.LEARNER_SERVICE, self._client)
             self._exchange = self._transport.exchange("RecordTrajectories", timeout=self._timeout)
             self._submit(list(self.pending.values()))
         while self._in_flight:

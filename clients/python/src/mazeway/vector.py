@@ -12,6 +12,7 @@ import numpy.typing as npt
 from gymnasium.vector.utils import batch_space
 
 from mazeway import _arrays
+from mazeway._link import First, Stepped
 from mazeway._session import DEFAULT_ADDRESS, DEFAULT_TIMEOUT_SECS, Session
 from mazeway.env import MazewayEnv, action_space, check_seed, refuse_options, render, server_env_id
 from mazeway.errors import InvalidArgumentError
@@ -56,6 +57,7 @@ class MazewayVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         action_masks: bool = False,
         timeout: float = DEFAULT_TIMEOUT_SECS,
         lease_secs: float | None = None,
+        client: str = "auto",
         **options: Any,
     ) -> None:
         """Opens the session.
@@ -71,6 +73,7 @@ class MazewayVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             action_masks: True adds `infos["action_mask"]`, int8, shape (num_envs, n_actions).
             timeout: Longest wait for any answer, in seconds.
             lease_secs: How long the session outlives its last use; None is the server's default.
+            client: "native", "grpc", or "auto" for the native one where it is built.
             **options: The environment's own options.
         """
         super().__init__()
@@ -82,6 +85,7 @@ class MazewayVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         self.autoreset_mode = _autoreset_mode(autoreset_mode)
         self.env_id = server_env_id(env_id)
         self.address = address
+        self.client = client
         self.options = options
         self.num_envs = num_envs
         self.render_mode = render_mode
@@ -95,6 +99,7 @@ class MazewayVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             action_masks=action_masks,
             timeout=timeout,
             lease_secs=lease_secs,
+            client=client,
         )
         spec = self._session.open()
         self.metadata = {**type(self).metadata, "autoreset_mode": self.autoreset_mode}
@@ -104,10 +109,7 @@ class MazewayVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         self.single_observation_space = _arrays.space_from_wire(spec.observation_space)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self._columns = [_arrays.Column.from_wire(c) for c in spec.info_columns]
-        self._dtype = _arrays.space_dtype(spec.observation_space)
-        self._action_dtype = _arrays.space_dtype(spec.action_space)
-        self._ended: Flags = np.zeros(num_envs, np.bool_)
+        self._columns = [(column.name, f"_{column.name}") for column in spec.info_columns]
 
     def reset(
         self,
@@ -131,12 +133,10 @@ class MazewayVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         if seed is None or isinstance(seed, (int, np.integer)):
             seed = None if seed is None else check_seed(seed)
             super().reset(seed=seed)
-            response = self._reset(seed, None, mask)
+            observations, columns = self._reset(seed, None, mask)
         else:
-            response = self._reset_each(list(seed), mask)
-        self._ended = np.zeros_like(self._ended) if mask is None else self._ended & ~mask
-        every = np.ones(self.num_envs, np.bool_) if mask is None else mask
-        return self._observations(response.observations), self._infos(response.infos, every)
+            observations, columns = self._reset_each(list(seed), mask)
+        return observations, self._infos(columns, mask)
 
     def step(
         self, actions: Any
@@ -148,23 +148,26 @@ class MazewayVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             infos, with the last observation and info of ended episodes in "final_obs" and "final_info"
             under SAME_STEP.
         """
-        packed = _arrays.pack(actions, self._action_dtype, (self.num_envs,), "actions")
-        response = self._session.step(packed)
-        shape = (self.num_envs,)
-        terminated = _arrays.unpack(response.terminated, _arrays.UINT8, shape, "terminated") != 0
-        truncated = _arrays.unpack(response.truncated, _arrays.UINT8, shape, "truncated") != 0
-        self._ended = terminated | truncated
-        infos: dict[str, Any] = {}
-        if response.final_observations:
-            infos = self._final(response)
-        infos.update(self._infos(response.infos, np.ones(self.num_envs, np.bool_)))
-        return (
-            self._observations(response.observations),
-            _arrays.unpack(response.rewards, _arrays.FLOAT64, shape, "rewards"),
-            terminated,
-            truncated,
-            infos,
-        )
+        return self._said(self._session.step(actions))
+
+    def send(self, actions: Any) -> None:
+        """Sends one action an environment and returns at once: the agent may work while the server does.
+
+        `recv` brings what came of them. Several steps may be under way; they are answered in order.
+        """
+        self._session.send(actions)
+
+    def recv(self) -> tuple[npt.NDArray[Any], npt.NDArray[np.float64], Flags, Flags, dict[str, Any]]:
+        """What came of the oldest actions that were sent and not yet received, as `step` returns it."""
+        return self._said(self._session.receive())
+
+    def step_async(self, actions: Any) -> None:
+        """`send` by the name that `gymnasium.vector.AsyncVectorEnv` has for it."""
+        self.send(actions)
+
+    def step_wait(self) -> tuple[npt.NDArray[Any], npt.NDArray[np.float64], Flags, Flags, dict[str, Any]]:
+        """`recv` by the name that `gymnasium.vector.AsyncVectorEnv` has for it."""
+        return self.recv()
 
     def render(self) -> tuple[Any, ...] | None:
         """Draws every environment."""
@@ -178,15 +181,15 @@ class MazewayVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         if hasattr(self, "_session"):  # Gymnasium 1.0 closes what failed to be made, too
             self._session.close()
 
-    def _reset(self, seed: int | None, seeds: npt.NDArray[Any] | None, mask: Flags | None) -> Any:
+    def _reset(self, seed: int | None, seeds: list[int] | None, mask: Flags | None) -> First:
         return self._session.reset(
             seed=seed,
-            seeds=b"" if seeds is None else seeds.astype(_arrays.UINT64).tobytes(),
-            mask=b"" if mask is None else mask.astype(_arrays.UINT8).tobytes(),
+            seeds=seeds,
+            mask=mask,
             draw=lambda: int(self.np_random.integers(2**63)),
         )
 
-    def _reset_each(self, seeds: list[int | None], mask: Flags | None) -> Any:
+    def _reset_each(self, seeds: list[int | None], mask: Flags | None) -> First:
         """Resets with a seed each; environments without one go on with their generator."""
         if len(seeds) != self.num_envs:
             raise InvalidArgumentError(
@@ -195,7 +198,7 @@ class MazewayVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         given = np.array([s is not None for s in seeds])
         if not given.any():
             return self._reset(None, None, mask)
-        values = np.array([0 if s is None else check_seed(s) for s in seeds], np.uint64)
+        values = [0 if s is None else check_seed(s) for s in seeds]
         if given.all():
             return self._reset(None, values, mask)
         every = np.ones(self.num_envs, np.bool_) if mask is None else mask
@@ -221,33 +224,38 @@ class MazewayVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             )
         return mask
 
-    def _observations(self, data: bytes) -> npt.NDArray[Any]:
-        shape = (self.num_envs, *(self.single_observation_space.shape or ()))
-        return _arrays.unpack(data, self._dtype, shape, "observations").astype(
-            self.observation_space.dtype, copy=False
-        )
+    def _said(
+        self, stepped: Stepped
+    ) -> tuple[npt.NDArray[Any], npt.NDArray[np.float64], Flags, Flags, dict[str, Any]]:
+        observations, rewards, terminated, truncated, columns, last = stepped
+        infos = self._infos(columns, None)
+        if last is not None:
+            infos = {**self._final(last, terminated | truncated), **infos}
+        return observations, rewards, terminated, truncated, infos
 
-    def _infos(self, data: Sequence[bytes], mask: Flags) -> dict[str, Any]:
-        """Each column and, as Gymnasium has it, `_column`: which rows mean something."""
+    def _infos(self, columns: list[npt.NDArray[Any]], mask: Flags | None) -> dict[str, Any]:
+        """Each column and, as Gymnasium has it, `_column`: which rows mean something; None is all."""
         infos: dict[str, Any] = {}
-        for column, packed in zip(self._columns, data, strict=True):
-            values = column.batch(packed, self.num_envs)
-            values[~mask] = 0
-            infos[column.name] = values
-            infos[f"_{column.name}"] = mask.copy()
+        for (name, masked), values in zip(self._columns, columns, strict=True):
+            infos[name] = values
+            if mask is None:
+                infos[masked] = np.ones(self.num_envs, np.bool_)
+            else:
+                values[~mask] = 0
+                infos[masked] = mask.copy()
         return infos
 
-    def _final(self, response: Any) -> dict[str, Any]:
+    def _final(self, last: First, ended: Flags) -> dict[str, Any]:
         """Last observations and infos of the episodes that ended in this step."""
-        rows = self._observations(response.final_observations)
-        last = np.full(self.num_envs, None, dtype=object)
-        for i in np.flatnonzero(self._ended):
-            last[i] = rows[i].copy()
+        rows, columns = last
+        observations = np.full(self.num_envs, None, dtype=object)
+        for i in np.flatnonzero(ended):
+            observations[i] = rows[i].copy()
         return {
-            "final_obs": last,
-            "_final_obs": self._ended.copy(),
-            "final_info": self._infos(response.final_infos, self._ended),
-            "_final_info": self._ended.copy(),
+            "final_obs": observations,
+            "_final_obs": ended.copy(),
+            "final_info": self._infos(columns, ended),
+            "_final_info": ended.copy(),
         }
 
 

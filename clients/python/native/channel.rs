@@ -1,0 +1,298 @@
+//! Calls as bytes over one connection: Python has the messages, this has the wire.
+
+use crate::{
+    driver::{Driver, Keeper, Local},
+    errors::Failure,
+};
+use bytes::{Buf as _, BufMut as _, Bytes};
+use mazeway_client::Connection;
+use pyo3::{exceptions::PyValueError, prelude::*, types::PyBytes};
+use std::{
+    mem,
+    sync::{Arc, Mutex as Lock, PoisonError},
+    time::Duration,
+};
+use tokio::{
+    sync::{Mutex, OnceCell, mpsc},
+    task::JoinHandle,
+};
+use tokio_stream::wrappers::UnboundedReceiverStream;
+use tonic::{
+    Request, Status, Streaming,
+    client::Grpc,
+    codec::{Codec, DecodeBuf, Decoder, EncodeBuf, Encoder},
+    codegen::http::uri::PathAndQuery,
+    transport::Channel as Transport,
+};
+
+/// Largest message either way.
+const MAX_MESSAGE_BYTES: usize = 256 << 20;
+
+/// Messages as they are.
+#[derive(Debug, Clone, Copy, Default)]
+struct Raw;
+
+impl Codec for Raw {
+    type Encode = Bytes;
+    type Decode = Bytes;
+    type Encoder = Self;
+    type Decoder = Self;
+
+    fn encoder(&mut self) -> Self {
+        Self
+    }
+
+    fn decoder(&mut self) -> Self {
+        Self
+    }
+}
+
+impl Encoder for Raw {
+    type Item = Bytes;
+    type Error = Status;
+
+    fn encode(&mut self, item: Bytes, out: &mut EncodeBuf<'_>) -> Result<(), Status> {
+        out.put(item);
+        Ok(())
+    }
+}
+
+impl Decoder for Raw {
+    type Item = Bytes;
+    type Error = Status;
+
+    fn decode(&mut self, message: &mut DecodeBuf<'_>) -> Result<Option<Bytes>, Status> {
+        Ok(Some(message.copy_to_bytes(message.remaining())))
+    }
+}
+
+/// A connection and who drives it.
+#[derive(Debug)]
+pub struct Link {
+    pub driver: Arc<Driver>,
+    pub dial: Arc<Dial>,
+}
+
+/// A connection alone: what a task of the driver may hold without keeping the driver.
+#[derive(Debug)]
+pub struct Dial {
+    address: String,
+    transport: OnceCell<Transport>,
+}
+
+impl Dial {
+    /// The connection, opened with its first use.
+    async fn transport(&self) -> Result<Transport, Failure> {
+        Ok(self.transport.get_or_try_init(|| mazeway_client::channel(&self.address)).await?.clone())
+    }
+
+    /// The same for the typed client.
+    pub async fn connection(&self) -> Result<Connection, Failure> {
+        Ok(Connection::from_channel(self.transport().await?))
+    }
+
+    async fn grpc(&self) -> Result<Grpc<Transport>, Failure> {
+        let mut grpc = Grpc::new(self.transport().await?)
+            .max_decoding_message_size(MAX_MESSAGE_BYTES)
+            .max_encoding_message_size(MAX_MESSAGE_BYTES);
+        grpc.ready().await.map_err(|error| Failure::from(Status::from_error(error.into())))?;
+        Ok(grpc)
+    }
+}
+
+/// A call's path, such as `/mazeway.env.v1.EnvironmentService/Render`.
+fn path(text: &str) -> PyResult<PathAndQuery> {
+    text.parse().map_err(|error| PyValueError::new_err(format!("{text}: {error}")))
+}
+
+/// Seconds as Python counts them.
+pub fn seconds(secs: f64) -> Duration {
+    // Negative and no number: none. Beyond all bounds: the driver has its own.
+    Duration::try_from_secs_f64(secs).unwrap_or(if secs > 0.0 { Duration::MAX } else { Duration::ZERO })
+}
+
+/// One connection to a server; connects with the first call.
+#[pyclass(frozen, module = "mazeway._native")]
+#[derive(Debug)]
+pub struct Channel(Local<Arc<Link>>);
+
+impl Channel {
+    pub fn link(&self) -> PyResult<&Arc<Link>> {
+        self.0.get()
+    }
+}
+
+#[pymethods]
+impl Channel {
+    #[new]
+    fn new(address: String, keeper: &Keeper) -> PyResult<Self> {
+        let driver = Arc::new(Driver::new()?);
+        keeper.watch(&driver)?;
+        Ok(Self(Local::new(Arc::new(Link { driver, dial: Arc::new(Dial { address, transport: OnceCell::new() }) }))))
+    }
+
+    /// One request, one answer.
+    fn unary<'py>(&self, py: Python<'py>, path: &str, request: &[u8], timeout: f64) -> PyResult<Bound<'py, PyBytes>> {
+        let (link, path, request) = (self.link()?, self::path(path)?, Bytes::copy_from_slice(request));
+        let call = async {
+            let answer = link.dial.grpc().await?.unary(Request::new(request), path, Raw).await;
+            Ok::<_, Failure>(answer?.into_inner())
+        };
+        Ok(PyBytes::new(py, &link.driver.wait(py, seconds(timeout), call)??))
+    }
+
+    /// Many requests, one answer.
+    fn requests<'py>(
+        &self,
+        py: Python<'py>,
+        path: &str,
+        requests: Vec<Vec<u8>>,
+        timeout: f64,
+    ) -> PyResult<Bound<'py, PyBytes>> {
+        let (link, path) = (self.link()?, self::path(path)?);
+        let requests = tokio_stream::iter(requests.into_iter().map(Bytes::from));
+        let call = async {
+            let answer = link.dial.grpc().await?.client_streaming(Request::new(requests), path, Raw).await;
+            Ok::<_, Failure>(answer?.into_inner())
+        };
+        Ok(PyBytes::new(py, &link.driver.wait(py, seconds(timeout), call)??))
+    }
+
+    /// One request, many answers.
+    fn answers(&self, path: &str, request: &[u8]) -> PyResult<Answers> {
+        let (link, path, request) = (self.link()?, self::path(path)?, Bytes::copy_from_slice(request));
+        let dial = Arc::clone(&link.dial);
+        let call = link.driver.runtime().spawn(async move {
+            let answer = dial.grpc().await?.server_streaming(Request::new(request), path, Raw).await;
+            Ok::<_, Failure>(answer?.into_inner())
+        });
+        Ok(Answers(Local::new(Incoming::new(link, call))))
+    }
+
+    /// A stream both ways.
+    fn exchange(&self, path: &str) -> PyResult<Exchange> {
+        let (link, path) = (self.link()?, self::path(path)?);
+        let (requests, body) = mpsc::unbounded_channel();
+        let dial = Arc::clone(&link.dial);
+        let call = link.driver.runtime().spawn(async move {
+            let body = UnboundedReceiverStream::new(body);
+            let answer = dial.grpc().await?.streaming(Request::new(body), path, Raw).await;
+            Ok::<_, Failure>(answer?.into_inner())
+        });
+        Ok(Exchange(Local::new((Lock::new(Some(requests)), Incoming::new(link, call)))))
+    }
+}
+
+/// The answers of a stream.
+#[derive(Debug)]
+struct Incoming {
+    link: Arc<Link>,
+    state: Mutex<State>,
+}
+
+#[derive(Debug)]
+enum State {
+    Opening(JoinHandle<Result<Streaming<Bytes>, Failure>>),
+    Open(Streaming<Bytes>),
+    Over,
+}
+
+impl Incoming {
+    fn new(link: &Arc<Link>, call: JoinHandle<Result<Streaming<Bytes>, Failure>>) -> Self {
+        Self { link: Arc::clone(link), state: Mutex::new(State::Opening(call)) }
+    }
+
+    /// The next answer; `None` where the stream is over.
+    async fn next(&self) -> Result<Option<Bytes>, Failure> {
+        let mut state = self.state.lock().await;
+        loop {
+            let ended = match &mut *state {
+                State::Opening(call) => match call.await {
+                    Ok(Ok(answers)) => {
+                        *state = State::Open(answers);
+                        continue;
+                    }
+                    Ok(Err(failure)) => Err(failure),
+                    Err(error) => Err(Failure::protocol(error.to_string())),
+                },
+                State::Open(answers) => match answers.message().await {
+                    Ok(Some(answer)) => return Ok(Some(answer)),
+                    Ok(None) => Ok(None),
+                    Err(status) => Err(status.into()),
+                },
+                State::Over => Ok(None),
+            };
+            *state = State::Over;
+            return ended;
+        }
+    }
+
+    fn receive<'py>(&self, py: Python<'py>, timeout: f64) -> PyResult<Option<Bound<'py, PyBytes>>> {
+        let answer = self.link.driver.wait(py, seconds(timeout), self.next())??;
+        Ok(answer.map(|answer| PyBytes::new(py, &answer)))
+    }
+
+    /// Ends the stream; one that another thread waits for ends there.
+    fn cancel(&self, py: Python<'_>) {
+        if let Ok(mut state) = self.state.try_lock()
+            && let State::Opening(call) = mem::replace(&mut *state, State::Over)
+        {
+            call.abort();
+        }
+        self.link.driver.settle(py);
+    }
+}
+
+/// The answers of a call, one after another.
+#[pyclass(frozen, module = "mazeway._native")]
+#[derive(Debug)]
+pub struct Answers(Local<Incoming>);
+
+#[pymethods]
+impl Answers {
+    /// Waits for the next answer; None where there are no more.
+    fn receive<'py>(&self, py: Python<'py>, timeout: f64) -> PyResult<Option<Bound<'py, PyBytes>>> {
+        self.0.get()?.receive(py, timeout)
+    }
+
+    /// Ends the call at once; may be called twice.
+    fn cancel(&self, py: Python<'_>) -> PyResult<()> {
+        self.0.get()?.cancel(py);
+        Ok(())
+    }
+}
+
+/// Requests that wait to be sent; none where the stream is over.
+type Outgoing = Lock<Option<mpsc::UnboundedSender<Bytes>>>;
+
+/// A stream both ways, whose n-th answer is to the n-th request.
+#[pyclass(frozen, module = "mazeway._native")]
+#[derive(Debug)]
+pub struct Exchange(Local<(Outgoing, Incoming)>);
+
+#[pymethods]
+impl Exchange {
+    /// Sends a request; never waits.
+    fn send(&self, py: Python<'_>, request: &[u8]) -> PyResult<()> {
+        let (requests, incoming) = self.0.get()?;
+        if let Some(requests) = &*requests.lock().unwrap_or_else(PoisonError::into_inner) {
+            // A stream that has ended says why with its next answer.
+            let _ = requests.send(Bytes::copy_from_slice(request));
+        }
+        incoming.link.driver.settle(py);
+        Ok(())
+    }
+
+    /// Waits for the next answer; None where there are no more.
+    fn receive<'py>(&self, py: Python<'py>, timeout: f64) -> PyResult<Option<Bound<'py, PyBytes>>> {
+        self.0.get()?.1.receive(py, timeout)
+    }
+
+    /// Ends the stream at once; may be called twice.
+    fn cancel(&self, py: Python<'_>) -> PyResult<()> {
+        let (requests, incoming) = self.0.get()?;
+        requests.lock().unwrap_or_else(PoisonError::into_inner).take();
+        incoming.cancel(py);
+        Ok(())
+    }
+}

@@ -19,6 +19,10 @@ use pyo3::{
 use std::{sync::Arc, time::Duration};
 use tokio::sync::Mutex;
 
+/// How long a stream that ended while nobody looked is tried to be opened anew: the next one says what was wrong. To make a
+/// lost session anew is for Python.
+const RESUME: Duration = Duration::from_secs(1);
+
 /// Observations, info columns.
 type First = (Py<PyAny>, Py<PyList>);
 /// Observations, rewards, terminated, truncated, info columns, and the last observations and columns where episodes ended.
@@ -89,8 +93,7 @@ impl Inner {
             env
         } else {
             let connection = self.link.dial.connection().await?;
-            // A session that was lost is Python's to make anew: nothing is tried again here.
-            slot.insert(VectorEnv::attach(&connection, self.created.clone(), Some(Duration::ZERO))?)
+            slot.insert(VectorEnv::attach(&connection, self.created.clone(), Some(RESUME))?)
         };
         Ok(match ask {
             Ask::Reset(seeds, None) => Said::First(env.reset(seeds).await?),

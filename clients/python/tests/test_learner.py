@@ -118,7 +118,8 @@ def test_the_learner_refuses_and_names_the_field(learner, style):
 
 def test_models_are_stored_once(learner):
     name = f"Toy-{uuid.uuid4()}"
-    dense = np.random.default_rng(0).dirichlet(np.ones(5), size=(5, 3))
+    # Another model each time: one content is stored under one name.
+    dense = np.random.default_rng().dirichlet(np.ones(5), size=(5, 3))
     model = mazeway.Model.from_dense(name, dense, rewards={"true": np.eye(5, 3)})
     model_id = learner.put_model(model)
     assert model_id == model.model_id, "the learner computes the same id"

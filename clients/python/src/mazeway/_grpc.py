@@ -130,10 +130,9 @@ class GrpcTransport:
         """The `MazewayError` that says what `error` says."""
         if error.code() is grpc.StatusCode.DEADLINE_EXCEEDED and _is_local_deadline(error):
             return late(self.address, timeout)
-        code, name = error.code().value
         return from_status(
-            code,
-            error.details() or name,
+            error.code().value[0],
+            error.details() or "",
             _violations(error),
             address=self.address,
             start=START[self.service],

@@ -144,7 +144,7 @@ def from_status(
         start: The command that starts such a server, for the hint.
     """
     name = _CODES[code] if 0 <= code < len(_CODES) else str(code)
-    details = " ".join(details.split())
+    details = " ".join(details.split()) or name
     if name == "unavailable":
         # Every layer that an error went through puts its own words before it.
         cause = _OS_ERROR.sub("", details.rpartition(": ")[2]).lower()

@@ -24,8 +24,26 @@ pub mod mazeway {
     }
 }
 
+/// Package `dm_env_rpc`: DeepMind's protocol, which the environment server speaks as well.
+pub mod dm_env_rpc {
+    /// Package `dm_env_rpc.v1`: worlds, tensors, the stream.
+    pub mod v1 {
+        tonic::include_proto!("dm_env_rpc.v1");
+        /// Package `dm_env_rpc.v1.extensions`.
+        pub mod extensions {
+            /// Package `dm_env_rpc.v1.extensions.properties`: values beside the stream of steps.
+            pub mod properties {
+                tonic::include_proto!("dm_env_rpc.v1.extensions.properties");
+            }
+        }
+    }
+}
+
+pub use dm_env_rpc::v1 as dm_env;
 pub use mazeway::env::v1 as env;
 pub use mazeway::learner::v1 as learner;
 
-/// Serialised `google.protobuf.FileDescriptorSet` of every file, dependencies included.
+/// Serialised `google.protobuf.FileDescriptorSet` of every file of `mazeway`, dependencies included.
 pub const FILE_DESCRIPTOR_SET: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/mazeway.desc"));
+/// Serialised `google.protobuf.FileDescriptorSet` of every file of `dm_env_rpc`, dependencies included.
+pub const DM_ENV_RPC_FILE_DESCRIPTOR_SET: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/dm_env_rpc.desc"));

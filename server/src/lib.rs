@@ -7,6 +7,8 @@ pub mod batch;
 #[cfg(feature = "grpc")]
 pub mod config;
 #[cfg(feature = "grpc")]
+mod dm_env;
+#[cfg(feature = "grpc")]
 mod grpc;
 pub mod raster;
 pub mod registry;

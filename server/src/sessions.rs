@@ -178,6 +178,11 @@ impl Sessions {
         self.lock().slots.len()
     }
 
+    /// True while the session lives, its lease run out or not.
+    pub fn contains(&self, id: SessionId) -> bool {
+        self.lock().slots.contains_key(&id)
+    }
+
     /// True where there is none.
     pub fn is_empty(&self) -> bool {
         self.len() == 0

@@ -6,6 +6,8 @@ pub mod fuzz;
 pub mod learner;
 pub mod programs;
 pub mod proxy;
+pub mod venv;
+pub mod worlds;
 
 use mazeway_server::Config;
 use std::{net::SocketAddr, thread::JoinHandle, time::Duration};

@@ -15,7 +15,7 @@ pub use buffers::{ACTION_MASK, Layout, StepBuffers};
 pub use error::BatchError;
 
 use crate::sim::{Configured, DType, EnvSpec, InfoColumn, Rng, Simulator};
-use std::sync::Arc;
+use std::{any::Any, sync::Arc};
 
 /// What happens to an environment whose episode has ended (Gymnasium 1.x, `AutoresetMode`).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -54,7 +54,7 @@ pub enum Seeds<'a> {
 }
 
 /// A batch of environments behind one face, whatever their kind.
-pub trait Batch: Send {
+pub trait Batch: Any + Send {
     /// The environment as configured.
     fn spec(&self) -> &Arc<EnvSpec>;
     /// Info columns in the order of the replies: the environment's and, where asked for, the action mask.

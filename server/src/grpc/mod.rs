@@ -2,8 +2,8 @@
 
 mod connections;
 mod from_proto;
-mod host;
-mod interact;
+pub(crate) mod host;
+pub(crate) mod interact;
 mod serve;
 mod service;
 mod status;
@@ -11,3 +11,4 @@ mod to_proto;
 
 pub use serve::{ServeError, serve};
 pub use status::CallError;
+pub(crate) use status::with_details;

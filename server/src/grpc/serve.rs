@@ -1,7 +1,7 @@
 //! A server from a listener to its shutdown.
 
 use super::{connections::at_most, host::Host, service::EnvironmentGrpc};
-use crate::config::Config;
+use crate::{config::Config, dm_env};
 use mazeway_proto::env::environment_service_server::EnvironmentServiceServer;
 use std::{future::Future, sync::Arc, time::Duration};
 use tokio::{net::TcpListener, time::timeout};
@@ -53,15 +53,19 @@ pub async fn serve(
         .max_decoding_message_size(max_message_bytes)
         // A reply's packed arrays are within the limit; their frame comes on top.
         .max_encoding_message_size(max_message_bytes + 4096);
+    let worlds = dm_env::EnvironmentServer(Arc::clone(&host));
     let (health, health_service) = tonic_health::server::health_reporter();
     health.set_serving::<EnvironmentServiceServer<EnvironmentGrpc>>().await;
+    health.set_serving::<dm_env::EnvironmentServer>().await;
     let reflection = || {
         tonic_reflection::server::Builder::configure()
             .register_encoded_file_descriptor_set(mazeway_proto::FILE_DESCRIPTOR_SET)
+            .register_encoded_file_descriptor_set(mazeway_proto::DM_ENV_RPC_FILE_DESCRIPTOR_SET)
             .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
     };
     let router = builder
         .add_service(environments)
+        .add_service(worlds)
         .add_service(health_service)
         .add_service(reflection().build_v1()?)
         .add_service(reflection().build_v1alpha()?);
@@ -73,6 +77,7 @@ pub async fn serve(
         outcome = &mut serving => outcome,
         () = shutdown => {
             health.set_not_serving::<EnvironmentServiceServer<EnvironmentGrpc>>().await;
+            health.set_not_serving::<dm_env::EnvironmentServer>().await;
             stopping.cancel();
             // Calls that need longer are cut off.
             timeout(grace, serving).await.unwrap_or(Ok(()))

@@ -53,7 +53,8 @@ impl CallError {
         Self::Malformed { field: field.into(), message: message.into() }
     }
 
-    fn code(&self) -> Code {
+    /// The code of the status.
+    pub fn code(&self) -> Code {
         match self {
             Self::Malformed { .. } | Self::Rollout(_) => Code::InvalidArgument,
             Self::Registry(error) => match error {
@@ -117,24 +118,28 @@ impl CallError {
 
 impl From<CallError> for Status {
     fn from(error: CallError) -> Self {
-        let (code, message, field) = (error.code(), error.to_string(), error.field().unwrap_or_default());
-        let mut details = ErrorDetails::new();
-        match code {
-            Code::FailedPrecondition => {
-                details.add_precondition_failure_violation(error.precondition(), field, message.as_str());
-            }
-            Code::ResourceExhausted => {
-                details.add_quota_failure_violation(field, message.as_str());
-            }
-            Code::Internal => {
-                tracing::error!(%message, "a call failed through no fault of its caller");
-                return Self::new(code, message);
-            }
-            Code::Unavailable => return Self::new(code, message),
-            _ => {
-                details.add_bad_request_violation(field, message.as_str());
-            }
-        }
-        Self::with_error_details(code, message, details)
+        with_details(error.code(), error.to_string(), error.field().unwrap_or_default(), error.precondition())
     }
+}
+
+/// A status whose details name the field that is to blame, as every error of this server has them.
+pub fn with_details(code: Code, message: String, field: String, precondition: &str) -> Status {
+    let mut details = ErrorDetails::new();
+    match code {
+        Code::FailedPrecondition => {
+            details.add_precondition_failure_violation(precondition, field, message.as_str());
+        }
+        Code::ResourceExhausted => {
+            details.add_quota_failure_violation(field, message.as_str());
+        }
+        Code::Internal => {
+            tracing::error!(%message, "a call failed through no fault of its caller");
+            return Status::new(code, message);
+        }
+        Code::Unavailable => return Status::new(code, message),
+        _ => {
+            details.add_bad_request_violation(field, message.as_str());
+        }
+    }
+    Status::with_error_details(code, message, details)
 }

@@ -7,7 +7,7 @@ mod drivers;
 pub mod highway;
 pub mod maze;
 pub mod model;
-mod options;
+pub(crate) mod options;
 pub mod rng;
 
 use std::sync::Arc;

@@ -6,7 +6,7 @@
 use crate::{
     batch::{Batch, BatchOptions, SimBatch},
     rollout::{EpisodeChunk, RolloutPlan, roll_out},
-    sim::{Configured, EnvSpec, OptionError, Simulator, TabularModel, highway, maze},
+    sim::{Configured, EnvSpec, OptionError, Simulator, TabularModel, highway, maze, options::shortened},
 };
 use serde_json::{Map, Value};
 use std::{
@@ -140,7 +140,7 @@ impl Registry {
     pub fn configure(&self, env_id: &str, options: &Options) -> Result<Arc<dyn Environment>, RegistryError> {
         let entry = self.entries.iter().find(|entry| entry.env_id == env_id);
         let entry = entry.ok_or_else(|| RegistryError::UnknownEnvironment {
-            env_id: env_id.into(),
+            env_id: shortened(env_id),
             known: self.env_ids().collect(),
         })?;
         Ok((entry.configure)(options)?)

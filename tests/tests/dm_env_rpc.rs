@@ -327,6 +327,7 @@ async fn hostile_requests_are_answered_and_the_stream_goes_on() {
         (maze("lease_secs", number(-1.0)), Code::InvalidArgument, "settings.lease_secs"),
         (maze("lease_secs", number(1e9)), Code::InvalidArgument, "settings.lease_secs"),
         (maze("options", text("[1]")), Code::InvalidArgument, "settings.options"),
+        (maze("options", text(&format!("{long:?}"))), Code::InvalidArgument, "settings.options"),
         (maze("options", text(&deep)), Code::InvalidArgument, "settings.options"),
         (maze("options.slip", text("much")), Code::InvalidArgument, "settings.options.slip"),
         (maze("options.slip", doubles(vec![0.1], &[2])), Code::InvalidArgument, "settings.options.slip"),
@@ -449,7 +450,7 @@ async fn a_peer_that_reads_nothing_is_held_up_and_nobody_else() {
     let specs = deaf.join(&world).await.expect("joins");
     let all: Vec<u64> = specs.observations.keys().copied().collect();
     let request = || {
-        let actions = [(1, int32s(vec![3], vec![2000]))].into();
+        let actions = [(1, int32s(vec![3; 2000], vec![2000]))].into();
         Some(Request::Step(pb::StepRequest { actions, requested_observations: all.clone() }))
     };
     // Far more than the windows hold: sending stops, for the server reads no further than it is read.
@@ -458,7 +459,7 @@ async fn a_peer_that_reads_nothing_is_held_up_and_nobody_else() {
             deaf.send(request()).await;
         }
     };
-    assert!(timeout(Duration::from_secs(3), sent).await.is_err(), "300 MB of answers that nobody has read");
+    assert!(timeout(Duration::from_secs(3), sent).await.is_err(), "6 MB of requests were read ahead of their answers");
     let mut other = Worlds::connect(&address).await;
     let world = other.create(settings([("env_id", text("Maze-v0"))])).await.expect("creates");
     other.join(&world).await.expect("joins");

@@ -96,14 +96,6 @@ impl From<RegistryError> for WorldError {
     }
 }
 
-/// At most 80 characters of what came, for messages that never repeat a large input.
-pub fn shortened(text: &str) -> String {
-    match text.char_indices().nth(80) {
-        None => text.to_owned(),
-        Some((end, _)) => format!("{}… ({} bytes)", &text[..end], text.len()),
-    }
-}
-
 impl WorldError {
     /// A field that cannot be read.
     pub fn malformed(field: impl Into<String>, message: impl Into<String>) -> Self {

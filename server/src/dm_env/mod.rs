@@ -17,3 +17,6 @@ mod tensor;
 mod world;
 
 pub use frames::EnvironmentServer;
+
+#[cfg(test)]
+mod tests;

@@ -7,7 +7,7 @@
 
 use super::{
     changes::{Changes, NewWorld},
-    error::{WorldError, shortened},
+    error::WorldError,
     properties,
     seat::{Interrupt, InterruptSender, Seat},
     settings::Settings,
@@ -16,6 +16,7 @@ use super::{
 use crate::{
     grpc::{CallError, host::Host, interact::INLINE_ENVS},
     sessions::{Guard, SessionError, SessionId},
+    sim::options::shortened,
 };
 use bytes::{Bytes, BytesMut};
 use futures_util::{Stream, stream};

@@ -2,18 +2,15 @@
 //!
 //! Invariant: what is written holds from the next sequence on, and never changes the specs of an agent who is not told.
 
-use super::{
-    changes::Changes,
-    error::{WorldError, shortened},
-    seat::Seat,
-    settings::integer,
-    tensor,
-};
+use super::{changes::Changes, error::WorldError, seat::Seat, settings::integer, tensor};
 use crate::{
     batch::Batch as _,
     grpc::{CallError, host::Host},
     registry::{Options, RegistryError},
-    sim::{EnvSpec, options::kind},
+    sim::{
+        EnvSpec,
+        options::{kind, shortened},
+    },
 };
 use mazeway_proto::dm_env::{
     DataType, Tensor, TensorSpec,

@@ -1,10 +1,10 @@
 //! Settings: tensors by name, each read once and by its type; what nobody has asked for is refused.
 
-use super::{
-    error::{WorldError, shortened},
-    tensor,
+use super::{error::WorldError, tensor};
+use crate::{
+    registry::Options,
+    sim::options::{self, shortened},
 };
-use crate::{registry::Options, sim::options};
 use mazeway_proto::dm_env::Tensor;
 use serde_json::Value;
 use std::{collections::BTreeMap, time::Duration};
@@ -63,7 +63,10 @@ impl Settings {
         let mut options = match self.text(ALL_OPTIONS)? {
             None => Options::new(),
             Some(text) => serde_json::from_str::<Options>(&text).map_err(|error| {
-                WorldError::malformed(path(ALL_OPTIONS), format!("expected a JSON object: {error}"))
+                WorldError::malformed(
+                    path(ALL_OPTIONS),
+                    format!("expected a JSON object: {}", shortened(&error.to_string())),
+                )
             })?,
         };
         while let Some((key, _)) = self.0.range(OPTION.to_owned()..).next().filter(|(key, _)| key.starts_with(OPTION)) {

@@ -263,3 +263,106 @@ pub fn from_json(value: &Value, default: &Value) -> Tensor {
 pub fn kind(tensor: &Tensor) -> (DataType, Vec<i32>) {
     (tensor.payload.as_ref().map_or(DataType::InvalidDataType, dtype), tensor.shape.clone())
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+    use serde_json::json;
+
+    fn doubles(array: Vec<f64>, shape: &[i32]) -> Tensor {
+        with_shape(Payload::Doubles(tensor::DoubleArray { array }), shape.to_vec())
+    }
+
+    fn int32s(array: Vec<i32>, shape: &[i32]) -> Tensor {
+        with_shape(Payload::Int32s(tensor::Int32Array { array }), shape.to_vec())
+    }
+
+    #[test]
+    fn shapes_follow_the_rules_of_the_protocol() {
+        let lengths = |shape: &[i32], elements| resolve(shape, elements).map(|r| r.lengths(shape).collect::<Vec<_>>());
+        assert_eq!(lengths(&[], 1), Ok(vec![]));
+        assert_eq!(lengths(&[2, 3], 6), Ok(vec![2, 3]));
+        assert_eq!(lengths(&[2, -1], 6), Ok(vec![2, 3]));
+        assert_eq!(lengths(&[-7], 0), Ok(vec![0]));
+        assert_eq!(lengths(&[0, 5], 0), Ok(vec![0, 5]));
+        // One element for all; a dimension that is left open is then 1.
+        assert_eq!(lengths(&[2, 3], 1), Ok(vec![2, 3]));
+        assert_eq!(lengths(&[2, -1], 1), Ok(vec![2, 1]));
+        for (shape, elements) in
+            [(&[-1, -1][..], 4), (&[2, 3], 5), (&[2, -1], 5), (&[0, -1], 3), (&[0], 1), (&[], 0), (&[], 2)]
+        {
+            assert!(lengths(shape, elements).is_err(), "{shape:?} with {elements}");
+        }
+        assert!(lengths(&[i32::MAX; 3], 1).is_err());
+    }
+
+    #[test]
+    fn values_are_nested_as_the_shape_says() {
+        let value = |tensor: &Tensor| to_json(tensor, "x").map_err(|error| error.to_string());
+        assert_eq!(value(&doubles(vec![0.25], &[])), Ok(json!(0.25)));
+        assert_eq!(value(&doubles(vec![4.0], &[])), Ok(json!(4)));
+        assert_eq!(value(&doubles(vec![1.0, 2.5, 3.0, 4.0], &[2, -1])), Ok(json!([[1, 2.5], [3, 4]])));
+        assert_eq!(value(&doubles(vec![1.0], &[2, 2])), Ok(json!([[1, 1], [1, 1]])));
+        assert_eq!(value(&doubles(vec![], &[2, 0])), Ok(json!([[], []])));
+        assert_eq!(
+            value(&with_shape(Payload::Int8s(tensor::Int8Array { array: vec![0xff].into() }), vec![])),
+            Ok(json!(-1))
+        );
+        assert_eq!(value(&uint64(u64::MAX)), Ok(json!(u64::MAX)));
+        for wrong in [
+            Tensor::default(),
+            doubles(vec![f64::NAN], &[]),
+            doubles(vec![1.0], &[1 << 20]),
+            doubles(vec![], &[1 << 20, 0]),
+            doubles(vec![1.0], &[1; 5]),
+            doubles(vec![1.0, 2.0], &[]),
+        ] {
+            assert!(value(&wrong).is_err(), "{wrong:?}");
+        }
+    }
+
+    #[test]
+    fn options_come_back_from_their_tensors() {
+        let round = |value: Value, default: Value| {
+            let tensor = from_json(&value, &default);
+            (kind(&tensor).0, to_json(&tensor, "x").expect("a value"))
+        };
+        assert_eq!(round(json!(4), json!(0.3)), (DataType::Double, json!(4)));
+        assert_eq!(round(json!(4), json!(3)), (DataType::Int64, json!(4)));
+        assert_eq!(round(json!(true), json!(false)), (DataType::Bool, json!(true)));
+        assert_eq!(round(json!("a"), json!("b")), (DataType::String, json!("a")));
+        assert_eq!(round(json!(["..", ".#"]), json!("")), (DataType::String, json!(["..", ".#"])));
+        assert_eq!(round(json!([[0, 1], [2, 0.5]]), Value::Null), (DataType::Double, json!([[0, 1], [2, 0.5]])));
+        // What no tensor can express is told as JSON.
+        for value in [json!(null), json!([]), json!([[0, 1], [2]]), json!([1, "a"]), json!({"a": 1})] {
+            assert_eq!(round(value.clone(), Value::Null), (DataType::String, json!(value.to_string())));
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn any_tensor_is_packed_or_refused(
+            array in proptest::collection::vec(any::<i32>(), 0..12),
+            shape in proptest::collection::vec(prop_oneof![-2..6, any::<i32>()], 0..4),
+            batch in proptest::option::of(1_usize..6),
+        ) {
+            let mut out = vec![7; 3];
+            let tensor = int32s(array.clone(), &shape);
+            match actions(&tensor, "actions[1]", batch, &mut out) {
+                Ok(()) => {
+                    let n = batch.unwrap_or(1);
+                    prop_assert_eq!(out.len(), 4 * n);
+                    prop_assert!(array.len() == 1 || array.len() == n);
+                    prop_assert_eq!(shape.len(), usize::from(batch.is_some()));
+                }
+                Err(error) => {
+                    prop_assert_eq!(out, vec![7; 3]);
+                    prop_assert_eq!(error.field().as_deref(), Some("actions[1]"));
+                }
+            }
+            // Whatever it claims to be, no more memory is taken than a setting may have.
+            let _ = to_json(&tensor, "x");
+        }
+    }
+}

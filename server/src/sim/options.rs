@@ -15,8 +15,17 @@ pub(crate) fn refuse_unknown(given: &Map<String, Value>, known: &[OptionSpec]) -
         None => Ok(()),
         Some(key) => {
             let names: Vec<&str> = known.iter().map(|option| option.name).collect();
-            Err(error(key, format!("expected one of the options {}, got {key:?}", names.join(", "))))
+            let key = shortened(key);
+            Err(error(&key, format!("expected one of the options {}, got {key:?}", names.join(", "))))
         }
+    }
+}
+
+/// At most 80 characters of what came, for messages that never repeat a large input.
+pub(crate) fn shortened(text: &str) -> String {
+    match text.char_indices().nth(80) {
+        None => text.to_owned(),
+        Some((end, _)) => format!("{}… ({} bytes)", &text[..end], text.len()),
     }
 }
 
@@ -90,6 +99,13 @@ mod tests {
             choice(&options, "style", &["bad", "legal"], 0).unwrap_err().to_string(),
             "style: expected one of bad, legal, got \"fast\""
         );
+    }
+
+    #[test]
+    fn no_message_repeats_a_large_input() {
+        let name = "ü".repeat(100_000);
+        let error = refuse_unknown(&given(json!({ name: 1 })), &[]).unwrap_err();
+        assert!(error.field.len() < 200 && error.message.len() < 300, "{error}");
     }
 
     #[test]

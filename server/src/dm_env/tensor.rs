@@ -358,7 +358,7 @@ mod tests {
                 }
                 Err(error) => {
                     prop_assert_eq!(out, vec![7; 3]);
-                    prop_assert_eq!(error.field().as_deref(), Some("actions[1]"));
+                    prop_assert_eq!(error.field(), Some("actions[1]".to_owned()));
                 }
             }
             // Whatever it claims to be, no more memory is taken than a setting may have.

@@ -6,7 +6,7 @@ use crate::{
     registry::Options,
     rollout::{Controller, RolloutError, RolloutPlan, TabularPolicy},
     sessions::SessionId,
-    sim::EnvSpec,
+    sim::{EnvSpec, options::shortened},
 };
 use mazeway_proto::env as pb;
 use prost_types::value::Kind;
@@ -19,10 +19,28 @@ const MAX_EXACT: f64 = 9_007_199_254_740_992.0;
 /// Options by name; numbers without a fraction become integers.
 pub fn options(options: Option<prost_types::Struct>) -> Result<Options, CallError> {
     let fields = options.unwrap_or_default().fields;
-    fields.into_iter().map(|(name, v)| Ok((name.clone(), value(&format!("options.{name}"), v)?))).collect()
+    let options = fields.into_iter().map(|(name, wire)| match value(wire) {
+        Ok(value) => Ok((name, value)),
+        Err(wrong) => Err(wrong.under(&name)),
+    });
+    options.collect::<Result<_, NotFinite>>().map_err(|NotFinite { path, got }| {
+        CallError::malformed(format!("options{path}"), format!("expected a finite number, got {got}"))
+    })
 }
 
-fn value(path: &str, value: prost_types::Value) -> Result<Value, CallError> {
+/// A number that is none, and where: the path is written on the way out, so that right values need none.
+struct NotFinite {
+    path: String,
+    got: f64,
+}
+
+impl NotFinite {
+    fn under(self, key: &str) -> Self {
+        Self { path: format!(".{}{}", shortened(key), self.path), ..self }
+    }
+}
+
+fn value(value: prost_types::Value) -> Result<Value, NotFinite> {
     Ok(match value.kind {
         None | Some(Kind::NullValue(_)) => Value::Null,
         Some(Kind::BoolValue(flag)) => Value::Bool(flag),
@@ -30,17 +48,21 @@ fn value(path: &str, value: prost_types::Value) -> Result<Value, CallError> {
         Some(Kind::NumberValue(number)) if number.fract() == 0.0 && number.abs() <= MAX_EXACT => {
             Value::from(number as i64)
         }
-        Some(Kind::NumberValue(number)) => Number::from_f64(number)
-            .map(Value::Number)
-            .ok_or_else(|| CallError::malformed(path, format!("expected a finite number, got {number}")))?,
+        Some(Kind::NumberValue(got)) => {
+            Number::from_f64(got).map(Value::Number).ok_or_else(|| NotFinite { path: String::new(), got })?
+        }
         Some(Kind::ListValue(list)) => {
-            let items = list.values.into_iter().enumerate();
-            Value::Array(items.map(|(i, item)| self::value(&format!("{path}[{i}]"), item)).collect::<Result<_, _>>()?)
+            let items = list.values.into_iter().enumerate().map(|(i, item)| {
+                self::value(item).map_err(|wrong| NotFinite { path: format!("[{i}]{}", wrong.path), ..wrong })
+            });
+            Value::Array(items.collect::<Result<_, _>>()?)
         }
         Some(Kind::StructValue(map)) => {
-            let fields = map.fields.into_iter();
-            let fields = fields.map(|(key, v)| Ok((key.clone(), self::value(&format!("{path}.{key}"), v)?)));
-            Value::Object(fields.collect::<Result<_, CallError>>()?)
+            let fields = map.fields.into_iter().map(|(key, wire)| match self::value(wire) {
+                Ok(value) => Ok((key, value)),
+                Err(wrong) => Err(wrong.under(&key)),
+            });
+            Value::Object(fields.collect::<Result<_, _>>()?)
         }
     })
 }

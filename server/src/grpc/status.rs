@@ -122,8 +122,23 @@ impl From<CallError> for Status {
     }
 }
 
-/// A status whose details name the field that is to blame, as every error of this server has them.
+/// Longest message of a status, in bytes: with its details it must fit into the headers of a response.
+const MAX_MESSAGE_BYTES: usize = 1000;
+/// Longest path of a field in the details of a status, in bytes.
+const MAX_FIELD_BYTES: usize = 300;
+
+fn clipped(text: String, most: usize) -> String {
+    if text.len() <= most {
+        return text;
+    }
+    let end = (0..=most).rev().find(|&end| text.is_char_boundary(end)).unwrap_or_default();
+    format!("{}… ({} bytes)", &text[..end], text.len())
+}
+
+/// A status whose details name the field that is to blame, as every error of this server has them. However much of a
+/// request an error repeats, the status stays small enough to be sent.
 pub fn with_details(code: Code, message: String, field: String, precondition: &str) -> Status {
+    let (message, field) = (clipped(message, MAX_MESSAGE_BYTES), clipped(field, MAX_FIELD_BYTES));
     let mut details = ErrorDetails::new();
     match code {
         Code::FailedPrecondition => {

@@ -10,8 +10,8 @@ machine disturbs them all. Medians over the rounds, with the lowest and the high
 
 Peers: a bare TCP ping-pong in Python (the floor); Gymnasium's own wrappers around an environment that does nothing; bare
 echoes by grpcio; dm_env_rpc's and OpenEnv's own servers and clients around a toy; EnvPool's FrozenLake and highway-fast,
-Gymnasium's vector environments and highway-env in process. Rust's own figures are those of `cargo run --release -p
-mazeway-tests --example wire -- --json`, where that example is there.
+Gymnasium's vector environments and highway-env in process. Rust's own figures, and the floor of blocking sockets in Rust,
+are those of `cargo bench -p mazeway-tests --bench wire -- --parts round_trips`, run in between.
 
 FrozenLake (16 states) is compared with the maze (57 states), highway-fast (continuous kinematics, 3 lanes, fewer vehicles
 and simulation steps than highway-v0) with our highway (12 vehicles, one decision a second): by what a user gets a second,
@@ -24,6 +24,7 @@ import os
 import statistics
 import subprocess
 import sys
+import tempfile
 import venv
 from pathlib import Path
 
@@ -132,7 +133,10 @@ class Servers:
 
     def __init__(self, python, binary, pin):
         self.processes, self.ports = [], {}
+        self.place = tempfile.TemporaryDirectory()
         self.ports["mazeway"] = int(self._start([*pin, binary, "--listen", "127.0.0.1:0"]).rpartition(":")[2])
+        self.ports["mazeway unix"] = f"{self.place.name}/socket"
+        self._start([*pin, binary, "--listen", f"unix:{self.ports['mazeway unix']}"])
         for name in ("tcp", "grpc", "dm_env_rpc", "openenv"):
             self.ports[name] = int(self._start([*pin, python, str(PEERS), "serve", name]))
 
@@ -151,6 +155,7 @@ class Servers:
             process.terminate()
         for process in self.processes:
             process.wait(30)
+        self.place.cleanup()
 
 
 def run(python, binary, cases, rounds, secs, pin):
@@ -166,16 +171,21 @@ def run(python, binary, cases, rounds, secs, pin):
         servers.stop()
 
 
-def rust_figures():
-    """What the Rust benchmark says, where there is one."""
-    if not (REPOSITORY / "tests" / "examples" / "wire.rs").is_file():
-        return None
-    command = ["cargo", "run", "--release", "-q", "-p", "mazeway-tests", "--example", "wire", "--", "--json"]
+def rust_figures(binary, rounds):
+    """Round trips by mode and name, as the Rust benchmark measures them; none where it is not there."""
+    if not (REPOSITORY / "tests" / "benches" / "wire" / "main.rs").is_file():
+        return {}
+    log("measuring round trips of the Rust client")
+    command = ["cargo", "bench", "-q", "-p", "mazeway-tests", "--bench", "wire", "--", "--json", "-"]
+    command += ["--parts", "round_trips", "--rounds", str(rounds), "--server", binary]
     done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False)
     if done.returncode:
         log(f"the Rust benchmark failed: {done.stderr.strip()[-300:]}")
-        return None
-    return json.loads(done.stdout)
+        return {}
+    figures = {}
+    for row in json.loads(done.stdout)["round_trips"]:
+        figures.setdefault(row["mode"], {})[row["name"]] = {k: row[k] for k in ("median", "low", "high")}
+    return figures
 
 
 def summary(times):
@@ -192,7 +202,7 @@ def table(title, unit, rows, digits):
     return lines
 
 
-def ratios(modes, batches):
+def ratios(modes, batches, rust):
     """The targets, each a ratio within one run, with what it should be."""
     found = []
 
@@ -261,12 +271,12 @@ def main():
     batches = {}
     for name, times in said["microseconds"].items():
         batches[name] = summary([said["sizes"][name] / time * 1e6 for time in times])
-    rust = None if arguments.no_rust else rust_figures()
+    rust = {} if arguments.no_rust else rust_figures(str(Path(binary).resolve()), arguments.rounds)
     result = {
         "round_trip_microseconds": modes,
         "steps_per_second": batches,
         "rust": rust,
-        "ratios": ratios(modes, batches),
+        "ratios": ratios(modes, batches, rust),
         "failures": failures,
         "rounds": arguments.rounds,
         "cores": os.cpu_count(),
@@ -281,6 +291,7 @@ def main():
     lines = []
     for mode, rows in modes.items():
         labelled = [(LABELS[name], row) for name, row in rows.items()]
+        labelled += [(f"Rust: {name}", row) for name, row in rust.get(mode, {}).items()]
         lines += [*table(f"one step, {mode}", "microseconds", labelled, 1), ""]
     million = [
         (LABELS[name], {key: value / 1e6 for key, value in row.items()}) for name, row in batches.items()

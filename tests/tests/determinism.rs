@@ -123,21 +123,24 @@ async fn rollouts_over_the_wire_are_those_of_any_number_of_threads() {
                 steps: 40,
                 burn_in_steps: 5,
                 totals_only: false,
+                compact: false,
                 chunk_episodes: 11,
             };
             for threads in [1, 3] {
                 let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("threads");
-                let mut local = EpisodeChunk::default();
+                let mut chunks: Vec<EpisodeChunk> = Vec::new();
                 pool.install(|| {
                     environment.roll_out(&plan, &|| false, &mut |chunk| {
-                        local = chunk;
+                        chunks.push(chunk);
                         true
                     });
                 });
-                assert_eq!(
-                    (&served.states, &served.actions, &served.rewards),
-                    (&local.states, &local.actions, &local.rewards)
-                );
+                let [local] = chunks.as_slice() else { panic!("expected one chunk, got {}", chunks.len()) };
+                let steps = &local.steps;
+                let column = |of: &dyn Fn(usize) -> u32| (0..steps.len()).map(of).collect::<Vec<_>>();
+                assert_eq!(served.states, column(&|at| steps.state(at)));
+                assert_eq!(served.actions, column(&|at| steps.action(at)));
+                assert_eq!(served.rewards, (0..steps.len()).map(|at| steps.reward(at)).collect::<Vec<_>>());
                 assert_eq!((&served.final_states, &served.returns), (&local.final_states, &local.returns));
                 assert_eq!(served.totals.iter().map(|(_, values)| values.clone()).collect::<Vec<_>>(), local.totals);
             }

@@ -55,7 +55,8 @@ async fn a_service_that_is_killed_in_a_fit_stores_nothing_of_it_and_repeats_it()
     let learner = Learner::connect(service.address()).await.expect("a learner");
     learner.put_model(&model).await.expect("a model");
     record(&learner, group(1, &model.model_id)).await;
-    let long = pb::FitRequest { draws: Some(100_000), ..request("birl") };
+    let mut long = request("birl");
+    long.options.get_or_insert_default().draws = Some(100_000);
     let mut stream = learner.fit_stream(long).await.expect("a fit that begins");
     // The kill comes once it is at work.
     assert!(stream.next().await.expect("news").is_some());

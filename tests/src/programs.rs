@@ -83,6 +83,11 @@ impl Service {
         &self.address
     }
 
+    /// Its process.
+    pub fn id(&self) -> u32 {
+        self.child.id()
+    }
+
     /// Ends it as a power cut would: SIGKILL, no chance to tidy up.
     ///
     /// # Panics

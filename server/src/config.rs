@@ -1,7 +1,7 @@
 //! Settings of a server: limits and times, each a flag and an environment variable of the binary.
 
-use crate::sessions::Limits;
-use std::{net::SocketAddr, time::Duration};
+use crate::{listen::ListenAddress, sessions::Limits};
+use std::time::Duration;
 
 /// Everything that a server can be told. [`Config::default`] has the defaults of the flags.
 #[derive(Debug, Clone, PartialEq, clap::Args)]
@@ -39,6 +39,9 @@ pub struct Config {
     /// Calls and streams of one connection at a time; a further one waits, so leave room for more than its sessions.
     #[arg(long, env = "MAZEWAY_MAX_STREAMS_PER_CONNECTION", default_value_t = 2048, value_name = "N")]
     pub max_streams_per_connection: u32,
+    /// Threads that serve connections, each connection on one of them; 0: as many as there are cores.
+    #[arg(long, env = "MAZEWAY_THREADS", default_value_t = 0, value_name = "N")]
+    pub threads: usize,
     /// Time between HTTP/2 pings that find out whether a silent peer is still there, in seconds.
     #[arg(long = "keepalive-secs", env = "MAZEWAY_KEEPALIVE_SECS", default_value = "10", value_parser = seconds, value_name = "SECS")]
     pub keepalive: Duration,
@@ -61,6 +64,7 @@ impl Default for Config {
             max_concurrent_models: 2,
             max_connections: 1024,
             max_streams_per_connection: 2048,
+            threads: 0,
             keepalive: Duration::from_secs(10),
             shutdown_grace: Duration::from_secs(5),
         }
@@ -68,6 +72,14 @@ impl Default for Config {
 }
 
 impl Config {
+    /// Threads that serve connections.
+    pub fn threads(&self) -> usize {
+        match self.threads {
+            0 => std::thread::available_parallelism().map_or(1, usize::from),
+            threads => threads,
+        }
+    }
+
     /// What sessions may take.
     pub fn limits(&self) -> Limits {
         Limits {
@@ -84,9 +96,10 @@ impl Config {
 #[derive(Debug, Clone, PartialEq, clap::Parser)]
 #[command(name = "server", version, about = "Serves Mazeway's environments over gRPC")]
 pub struct Cli {
-    /// Address to listen on; port 0 takes a free one. One line with the address goes to standard output.
+    /// Address to listen on, or unix:PATH for a Unix socket that its owner alone may use; port 0 takes a free one. One
+    /// line with the address goes to standard output.
     #[arg(long, env = "MAZEWAY_LISTEN", default_value = "127.0.0.1:50051", value_name = "ADDR")]
-    pub listen: SocketAddr,
+    pub listen: ListenAddress,
     /// Listen on an address that other machines reach, although nothing is encrypted and nobody is asked who they are.
     #[arg(long, env = "MAZEWAY_INSECURE")]
     pub insecure: bool,

@@ -10,6 +10,8 @@ pub mod config;
 mod dm_env;
 #[cfg(feature = "grpc")]
 mod grpc;
+#[cfg(feature = "grpc")]
+pub mod listen;
 pub mod raster;
 pub mod registry;
 pub mod rollout;
@@ -20,3 +22,5 @@ pub mod sim;
 pub use config::Config;
 #[cfg(feature = "grpc")]
 pub use grpc::{CallError, ServeError, serve};
+#[cfg(feature = "grpc")]
+pub use listen::{ListenAddress, Listener};

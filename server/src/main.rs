@@ -1,12 +1,11 @@
 //! The environment server's binary.
 
 use clap::Parser as _;
-use mazeway_server::{config::Cli, serve};
+use mazeway_server::{ListenAddress, Listener, config::Cli, serve};
 use std::{
     io::{self, Write as _},
     process::ExitCode,
 };
-use tokio::net::TcpListener;
 use tracing_subscriber::EnvFilter;
 
 fn main() -> ExitCode {
@@ -25,14 +24,15 @@ fn main() -> ExitCode {
     };
     let filter = EnvFilter::try_from_env("MAZEWAY_LOG").unwrap_or_else(|_| EnvFilter::new("warn"));
     tracing_subscriber::fmt().with_env_filter(filter).with_writer(io::stderr).init();
-    if !cli.listen.ip().is_loopback() && !cli.insecure {
+    if !cli.listen.is_local() && !cli.insecure {
         return refuse(
             2,
             &format!("{} is reached from other machines, and nothing on it is encrypted or authenticated", cli.listen),
             "listen on 127.0.0.1, or add --insecure where the network is trusted",
         );
     }
-    let runtime = match tokio::runtime::Builder::new_multi_thread().enable_all().build() {
+    // Connections are served by threads of their own: this one takes them in.
+    let runtime = match tokio::runtime::Builder::new_current_thread().enable_all().build() {
         Ok(runtime) => runtime,
         Err(error) => return refuse(1, &format!("no threads to run on: {error}"), "raise the limit on processes"),
     };
@@ -40,14 +40,14 @@ fn main() -> ExitCode {
 }
 
 async fn run(cli: Cli) -> ExitCode {
-    let listener = match TcpListener::bind(cli.listen).await {
+    let listener = match Listener::bind(&cli.listen).await {
         Ok(listener) => listener,
         Err(error) => {
-            return refuse(
-                1,
-                &format!("cannot listen on {}: {error}", cli.listen),
-                "take a free port: --listen 127.0.0.1:0",
-            );
+            let hint = match cli.listen {
+                ListenAddress::Tcp(_) => "take a free port: --listen 127.0.0.1:0",
+                ListenAddress::Unix(_) => "take a short path that is free, in a directory of yours",
+            };
+            return refuse(1, &format!("cannot listen on {}: {error}", cli.listen), hint);
         }
     };
     // Before anyone is told that the server is there, and may tell it to stop.
@@ -55,7 +55,7 @@ async fn run(cli: Cli) -> ExitCode {
         Ok(stop) => stop,
         Err(error) => return refuse(1, &format!("cannot catch signals: {error}"), "raise the limit on open files"),
     };
-    let address = listener.local_addr().unwrap_or(cli.listen);
+    let address = listener.address().unwrap_or(cli.listen);
     // Whoever started this may have closed the other end; the server serves all the same.
     let _ = writeln!(io::stdout(), "listening on {address}").and_then(|()| io::stdout().flush());
     match serve(cli.config, listener, stop).await {

@@ -79,6 +79,32 @@ fn a_port_in_use_is_an_error_with_a_hint() {
     child.wait().expect("ends");
 }
 
+#[cfg(unix)]
+#[test]
+fn a_unix_socket_is_private_survives_a_crash_and_goes_at_the_end() {
+    use std::os::unix::{fs::PermissionsExt as _, net::UnixStream};
+    let path = std::env::temp_dir().join(format!("mazeway-binary-{}.sock", std::process::id()));
+    let listen = format!("unix:{}", path.display());
+    let (mut child, address) = start(&mut server(&["--listen", &listen]));
+    assert_eq!(address, listen);
+    UnixStream::connect(&path).expect("it listens there");
+    assert_eq!(path.metadata().expect("a socket").permissions().mode() & 0o777, 0o600);
+    let (code, text) = fails(&mut server(&["--listen", &listen]));
+    assert_eq!(code, Some(1), "{text}");
+    assert!(text.starts_with(&format!("error: cannot listen on {listen}: ")) && text.contains("\nhint: "), "{text}");
+    // A power cut leaves the socket behind; the next server takes its place.
+    child.kill().expect("ends");
+    child.wait().expect("ends");
+    assert!(path.exists());
+    let (mut child, _) = start(&mut server(&["--listen", &listen]));
+    UnixStream::connect(&path).expect("it listens there");
+    let kill = Command::new("kill").args(["-s", "TERM", &child.id().to_string()]).status().expect("kill runs");
+    assert!(kill.success() && child.wait().expect("ends").success());
+    assert!(!path.exists(), "the socket stays behind");
+    let (code, text) = fails(&mut server(&["--listen", "unix:"]));
+    assert_eq!(code, Some(2), "{text}");
+}
+
 #[test]
 fn wrong_arguments_exit_with_2() {
     for wrong in [&["--port", "1"][..], &["--listen", "nowhere"], &["--default-lease-secs", "-3"], &["extra"]] {

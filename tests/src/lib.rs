@@ -9,8 +9,8 @@ pub mod proxy;
 pub mod venv;
 pub mod worlds;
 
-use mazeway_server::Config;
-use std::{net::SocketAddr, thread::JoinHandle, time::Duration};
+use mazeway_server::{Config, ListenAddress, Listener};
+use std::{net::SocketAddr, path::Path, thread::JoinHandle, time::Duration};
 use tokio::sync::oneshot;
 
 /// Default limits, but calls that still run at the end of a test are cut off soon: its clients no longer answer by then.
@@ -21,7 +21,7 @@ pub fn config() -> Config {
 /// A real environment server on a thread and a runtime of its own, so that tests with and without a runtime use it alike.
 #[derive(Debug)]
 pub struct EnvServer {
-    address: SocketAddr,
+    address: ListenAddress,
     stop: Option<oneshot::Sender<()>>,
     thread: Option<JoinHandle<()>>,
 }
@@ -45,13 +45,25 @@ impl EnvServer {
     /// # Panics
     /// The port cannot be bound.
     pub fn at(address: SocketAddr, config: Config) -> Self {
+        Self::listening(ListenAddress::Tcp(address), config)
+    }
+
+    /// Starts a server on a Unix socket.
+    ///
+    /// # Panics
+    /// The path cannot be bound.
+    pub fn unix(path: &Path, config: Config) -> Self {
+        Self::listening(ListenAddress::Unix(path.into()), config)
+    }
+
+    fn listening(address: ListenAddress, config: Config) -> Self {
         let (stop, stopped) = oneshot::channel();
         let (bound, is_bound) = std::sync::mpsc::channel();
         let thread = std::thread::spawn(move || {
-            let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build();
+            let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
             runtime.expect("a runtime").block_on(async move {
-                let listener = tokio::net::TcpListener::bind(address).await.expect("a port");
-                bound.send(listener.local_addr().expect("an address")).expect("the test waits");
+                let listener = Listener::bind(&address).await.expect("a free address");
+                bound.send(listener.address().expect("an address")).expect("the test waits");
                 let shutdown = async {
                     let _ = stopped.await;
                 };
@@ -63,8 +75,14 @@ impl EnvServer {
     }
 
     /// Where it listens.
+    ///
+    /// # Panics
+    /// On a Unix socket.
     pub fn socket(&self) -> SocketAddr {
-        self.address
+        match self.address {
+            ListenAddress::Tcp(address) => address,
+            ListenAddress::Unix(_) => panic!("expected a server on TCP"),
+        }
     }
 
     /// Where it listens, for clients.

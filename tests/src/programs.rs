@@ -54,8 +54,13 @@ impl Service {
 
     /// `server` on a free port.
     pub fn server() -> Self {
+        Self::server_at("127.0.0.1:0")
+    }
+
+    /// `server` at an address: `unix:PATH` for a Unix socket.
+    pub fn server_at(address: &str) -> Self {
         let mut command = Command::new(program("server"));
-        command.args(["--listen", "127.0.0.1:0"]);
+        command.args(["--listen", address]);
         Self::start(command)
     }
 

@@ -3,7 +3,7 @@
 use mazeway_client::{Autoreset, Code, Seeds};
 use mazeway_server::{registry::Registry, sim::Space};
 use mazeway_tests::{
-    EnvServer,
+    EnvServer, config,
     faces::{FACES, Face, Make, Reply, Subject},
 };
 use serde_json::{Map, Value, json};
@@ -20,12 +20,13 @@ fn environments() -> Vec<(&'static str, Map<String, Value>)> {
     ]
 }
 
-/// Every face with every environment.
+/// Every face with every environment, those of the wire over TCP and over a Unix socket.
 async fn for_all<F: Future<Output = ()>>(check: impl Fn(Face, String, Make) -> F) {
-    let server = EnvServer::start();
-    for face in FACES {
+    let directory = tempfile::tempdir().expect("a directory");
+    let servers = [EnvServer::start(), EnvServer::unix(&directory.path().join("env.sock"), config())];
+    for (face, server) in FACES.iter().flat_map(|face| servers.iter().map(move |server| (*face, server))) {
         for (env_id, options) in environments() {
-            println!("{face:?} {env_id} {options:?}");
+            println!("{face:?} {} {env_id} {options:?}", server.address());
             let make = Make { options, ..Make::new(env_id, 1, Autoreset::NextStep) };
             check(face, server.address(), make).await;
         }

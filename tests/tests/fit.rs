@@ -172,7 +172,8 @@ fn every_option_of_the_paper_s_algorithm_runs() {
 #[test]
 fn running_services_do_the_same_as_embedded_ones() {
     let (data, out) = (tempfile::tempdir().expect("a directory"), tempfile::tempdir().expect("a directory"));
-    let (service, server) = (Service::learner(data.path()), Service::server());
+    let socket = format!("unix:{}", data.path().join("env.sock").display());
+    let (service, server) = (Service::learner(data.path()), Service::server_at(&socket));
     let over_the_network = learner(&[
         "fit",
         "--style",

@@ -480,6 +480,36 @@ async fn many_steps_under_way_never_block_for_good() {
 }
 
 #[tokio::test]
+async fn a_client_that_reads_nothing_is_held_back_and_loses_nothing() {
+    const MANY: usize = 20_000;
+    let server = EnvServer::start();
+    let mut service = service(&server).await;
+    // Stepped where the request is read, and on another thread.
+    for num_envs in [200, 2000] {
+        let request = || pb::CreateSessionRequest { num_envs, max_episode_steps: Some(0), ..maze() };
+        let (id, twin) = (create(&mut service, request()).await, create(&mut service, request()).await);
+        let (requests, mut answers) = interact(&mut service).await;
+        send(&requests, Request::Reset(reset(&id, 1))).await;
+        let (mut sent, actions) = (0, |step: usize| vec![(step % 4) as i32; num_envs as usize]);
+        while sent < MANY {
+            let one = send(&requests, Request::Step(step("", &actions(sent))));
+            if tokio::time::timeout(Duration::from_secs(1), one).await.is_err() {
+                break;
+            }
+            sent += 1;
+        }
+        assert!(sent < MANY, "{sent} answers of {} bytes wait somewhere", num_envs * 22);
+        service.reset(reset(&twin, 1)).await.expect("resets");
+        answers.message().await.expect("answers").expect("an answer");
+        for i in 0..sent {
+            let answer = answers.message().await.expect("answers").expect("an answer").response;
+            let expected = service.step(step(&twin, &actions(i))).await.expect("steps").into_inner();
+            assert!(answer == Some(pb::interact_response::Response::Step(expected)), "answer {i}");
+        }
+    }
+}
+
+#[tokio::test]
 async fn a_client_that_is_dropped_frees_its_session() {
     let server = EnvServer::with(Config { max_sessions: 1, ..config() });
     let connection = Connection::open(&server.address()).await.expect("connects");

@@ -2,7 +2,7 @@
 
 use mazeway_client::{Autoreset, Code, Connection, Controller, Env, Rollout, SessionOptions, VectorEnv, channel};
 use mazeway_server::Config;
-use mazeway_tests::EnvServer;
+use mazeway_tests::{EnvServer, config};
 use std::time::{Duration, Instant};
 use tonic_health::pb::{HealthCheckRequest, health_client::HealthClient};
 use tonic_reflection::pb::{v1, v1alpha};
@@ -69,6 +69,34 @@ async fn a_server_with_open_streams_stops_in_its_grace() {
     assert!(begun.elapsed() < grace, "the idle stream was waited for");
     let error = env.step(0).await.expect_err("the server is gone");
     assert_eq!(error.code(), Code::Unavailable, "{error}");
+}
+
+#[tokio::test]
+async fn a_unix_socket_serves_all_that_tcp_does_and_goes_with_its_server() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let path = directory.path().join("env.sock");
+    let (unix, tcp) = (EnvServer::unix(&path, config()), EnvServer::start());
+    assert_eq!(unix.address(), format!("unix:{}", path.display()));
+    let mut health = HealthClient::new(channel(&unix.address()).await.expect("connects"));
+    health.check(HealthCheckRequest::default()).await.expect("answers");
+    for address in [unix.address(), format!("unix://{}", path.display())] {
+        let make = |address| async move { Env::connect(address, "Highway-v0", SessionOptions::default()).await };
+        let (mut env, mut twin) =
+            (make(&address).await.expect("connects"), make(&tcp.address()).await.expect("connects"));
+        assert_eq!(env.reset(Some(5)).await, twin.reset(Some(5)).await);
+        for action in 0..12 {
+            assert_eq!(env.step(action).await, twin.step(action).await);
+        }
+        assert_eq!(env.render_text().await, twin.render_text().await);
+        env.close().await.expect("closes");
+    }
+    let rollout = || Rollout { seed: 1, ..Rollout::new("Maze-v0", Controller::driver("random"), 3, 20) };
+    let drive = async |address| mazeway_client::rollout(address, rollout()).await.expect("drives");
+    assert_eq!(drive(&unix.address()).await, drive(&tcp.address()).await);
+    tokio::task::spawn_blocking(move || unix.stop()).await.expect("stops");
+    assert!(!path.exists(), "the socket stays behind");
+    let error = Connection::open(&format!("unix:{}", path.display())).await.expect_err("nobody is there");
+    assert!(error.to_string().contains("env.sock") && error.code() == Code::Unavailable, "{error}");
 }
 
 #[tokio::test]

@@ -43,7 +43,7 @@ class Process:
             if selector.select(timeout=1):
                 chunk = os.read(self.popen.stdout.fileno(), 4096)
                 seen += chunk
-                if found := re.search(rb"listening on (?:http://)?(\S+:\d+)\s", seen):
+                if found := re.search(rb"listening on (?:http://)?(unix:\S+|\S+:\d+)\s", seen):
                     selector.close()
                     return found[1].decode()
                 if not chunk:

@@ -17,12 +17,16 @@ const STREAM_WINDOW_BYTES: u32 = 4 << 20;
 /// Bytes of all streams that may wait: so many that a stream nobody reads never holds up the others.
 const CONNECTION_WINDOW_BYTES: u32 = 1 << 30;
 
-/// Connects to a server at `address`, such as `127.0.0.1:50051` or `http://[::1]:50051`.
+/// Largest frame taken in: an answer comes in few.
+const FRAME_BYTES: u32 = 1 << 20;
+
+/// Connects to a server at `address`, such as `127.0.0.1:50051`, `http://[::1]:50051` or `unix:/run/mazeway.sock`.
 ///
 /// # Errors
 /// An address that is none; nobody answers.
 pub async fn channel(address: &str) -> Result<Channel, ClientError> {
-    let uri = if address.contains("://") { address.to_owned() } else { format!("http://{address}") };
+    let whole = address.contains("://") || address.starts_with("unix:");
+    let uri = if whole { address.to_owned() } else { format!("http://{address}") };
     let endpoint = Endpoint::from_shared(uri)
         .map_err(|error| ClientError::Address { address: address.into(), message: error.to_string() })?;
     let endpoint = endpoint
@@ -32,7 +36,8 @@ pub async fn channel(address: &str) -> Result<Channel, ClientError> {
         .keep_alive_timeout(Duration::from_secs(10))
         .keep_alive_while_idle(true)
         .initial_stream_window_size(STREAM_WINDOW_BYTES)
-        .initial_connection_window_size(CONNECTION_WINDOW_BYTES);
+        .initial_connection_window_size(CONNECTION_WINDOW_BYTES)
+        .max_frame_size(FRAME_BYTES);
     endpoint.connect().await.map_err(|error| ClientError::Connect { address: address.into(), message: causes(&error) })
 }
 
@@ -53,11 +58,12 @@ fn causes(error: &dyn std::error::Error) -> String {
 /// A connection to an environment server. Cloning shares it.
 #[derive(Debug, Clone)]
 pub struct Connection {
+    pub(crate) channel: Channel,
     pub(crate) service: EnvironmentServiceClient<Channel>,
 }
 
 impl Connection {
-    /// Connects to a server at `address`, such as `127.0.0.1:50051`.
+    /// Connects to a server at `address`, such as `127.0.0.1:50051` or `unix:/run/mazeway.sock`.
     ///
     /// # Errors
     /// An address that is none; nobody answers.
@@ -67,10 +73,10 @@ impl Connection {
 
     /// Uses a channel that is there already.
     pub fn from_channel(channel: Channel) -> Self {
-        let service = EnvironmentServiceClient::new(channel)
+        let service = EnvironmentServiceClient::new(channel.clone())
             .max_decoding_message_size(MAX_MESSAGE_BYTES)
             .max_encoding_message_size(MAX_MESSAGE_BYTES);
-        Self { service }
+        Self { channel, service }
     }
 
     /// All environments with default options, in alphabetical order.

@@ -30,6 +30,7 @@ pub mod recorder;
 pub mod rollout;
 mod session;
 pub mod spec;
+mod stream;
 mod vector;
 
 pub use connection::{Connection, channel, list_environments, model, rollout};

@@ -6,18 +6,12 @@
 use crate::{
     ClientError, Connection, EnvSpec,
     spec::{Options, options_to_wire},
+    stream::{Ask, Open, Sent},
 };
-use mazeway_proto::env::{self as pb, AutoresetMode, interact_request::Request, interact_response::Response};
-use std::{
-    collections::VecDeque,
-    time::{Duration, Instant},
-};
-use tokio::sync::mpsc;
-use tokio_stream::wrappers::ReceiverStream;
-use tonic::{Code, Status, Streaming};
+use mazeway_proto::env::{self as pb, AutoresetMode, interact_response::Response};
+use std::time::{Duration, Instant};
+use tonic::{Code, Status};
 
-/// Requests that may be on their way before their answers are read.
-const PIPELINE: usize = 64;
 /// Requests that may be sent before the first of their answers is received.
 const MAX_UNDER_WAY: usize = 4096;
 /// How long a session is tried to be taken up again, unless asked otherwise.
@@ -69,49 +63,6 @@ pub struct Image {
     pub rgb: bytes::Bytes,
 }
 
-type Answer = Result<Option<pb::InteractResponse>, Status>;
-
-/// An open stream.
-#[derive(Debug)]
-struct Open {
-    requests: mpsc::Sender<pb::InteractRequest>,
-    answers: Streaming<pb::InteractResponse>,
-    /// Answers that were read to make room for further requests.
-    early: VecDeque<Answer>,
-    /// Requests whose answer nobody has received.
-    awaited: usize,
-}
-
-impl Open {
-    async fn answer(&mut self) -> Answer {
-        match self.early.pop_front() {
-            Some(answer) => answer,
-            None => self.answers.message().await,
-        }
-    }
-
-    /// Sends a request, reading answers as long as there is no room for it: otherwise both sides could wait for each
-    /// other. False where the stream has ended.
-    async fn send(&mut self, message: pb::InteractRequest) -> bool {
-        let Self { requests, answers, early, awaited } = self;
-        loop {
-            let open = early.back().is_none_or(|answer| matches!(answer, Ok(Some(_))));
-            tokio::select! {
-                biased;
-                room = requests.reserve() => match room {
-                    Ok(room) => {
-                        room.send(message);
-                        *awaited += 1;
-                        return true;
-                    }
-                    Err(_) => return false,
-                },
-                answer = answers.message(), if open && *awaited > early.len() => early.push_back(answer),
-            }
-        }
-    }
-}
-
 #[derive(Debug)]
 pub(crate) struct Session {
     connection: Connection,
@@ -122,23 +73,6 @@ pub(crate) struct Session {
     resume_within: Duration,
     open: Option<Open>,
     closed: bool,
-}
-
-fn name(request: &Request) -> &'static str {
-    match request {
-        Request::Reset(_) => "reset",
-        Request::Step(_) => "step",
-        Request::Close(_) => "close",
-    }
-}
-
-/// True where sending the request a second time changes nothing.
-fn repeatable(request: &Request) -> bool {
-    match request {
-        Request::Reset(reset) => (reset.seed.is_some() || !reset.seeds.is_empty()) && reset.reset_mask.is_empty(),
-        Request::Step(_) => false,
-        Request::Close(_) => true,
-    }
 }
 
 /// True where the connection and not the server is to blame.
@@ -200,44 +134,34 @@ impl Session {
         &self.id
     }
 
-    /// The stream, opened anew where there is none.
-    async fn stream(&mut self) -> Result<&mut Open, Status> {
+    /// The stream, opened anew where there is none, and the session's id.
+    async fn stream(&mut self) -> Result<(&mut Open, &str), Status> {
         if self.open.is_none() {
-            let (requests, body) = mpsc::channel(PIPELINE);
-            let answers = self.connection.service.clone().interact(ReceiverStream::new(body)).await?.into_inner();
-            self.open = Some(Open { requests, answers, early: VecDeque::new(), awaited: 0 });
+            self.open = Some(Open::new(self.connection.channel.clone()).await?);
         }
-        Ok(self.open.as_mut().expect("just opened"))
-    }
-
-    fn message(&self, request: &Request) -> pb::InteractRequest {
-        let mut request = request.clone();
-        // The session is named every time: a few bytes, and no state to keep in step with the server's.
-        match &mut request {
-            Request::Reset(reset) => reset.session_id.clone_from(&self.id),
-            Request::Step(step) => step.session_id.clone_from(&self.id),
-            Request::Close(close) => close.session_id.clone_from(&self.id),
-        }
-        pb::InteractRequest { request: Some(request) }
+        Ok((self.open.as_mut().expect("just opened"), &self.id))
     }
 
     /// Sends a request whose answer [`Self::receive`] will bring.
-    pub async fn send(&mut self, request: &Request) -> Result<(), ClientError> {
+    pub async fn send(&mut self, ask: Ask<'_>) -> Result<(), ClientError> {
         if self.closed {
             return Err(ClientError::Argument { field: "session_id", message: "the environment was closed".into() });
         }
-        let message = self.message(request);
-        let open = self.stream().await?;
+        let (open, id) = self.stream().await?;
+        let too_many = |message| Err(ClientError::Argument { field: "request", message });
         if open.awaited == MAX_UNDER_WAY {
-            let message = format!("expected at most {MAX_UNDER_WAY} requests without receiving their answers");
-            return Err(ClientError::Argument { field: "request", message });
+            return too_many(format!("expected at most {MAX_UNDER_WAY} requests without receiving their answers"));
         }
-        if !open.send(message).await && open.awaited == 0 {
-            self.open = None;
-            return Err(ClientError::Interrupted { request: name(request), message: "the stream ended".into() });
+        match open.send(ask, id).await {
+            Sent::Yes => Ok(()),
+            Sent::Full => too_many("expected the answers that are waiting to be received before more is sent".into()),
+            // Where it ended with answers to come, the last of these says why.
+            Sent::Ended if open.awaited > 0 => Ok(()),
+            Sent::Ended => {
+                self.open = None;
+                Err(ClientError::Interrupted { request: ask.name(), message: "the stream ended".into() })
+            }
         }
-        // Where it ended with answers to come, the last of these says why.
-        Ok(())
     }
 
     /// The next answer.
@@ -270,15 +194,16 @@ impl Session {
     }
 
     /// Sends a request and waits for its answer; takes the session up again where the connection broke before.
-    pub async fn call(&mut self, request: Request) -> Result<Response, ClientError> {
+    pub async fn call(&mut self, ask: Ask<'_>) -> Result<Response, ClientError> {
         self.settle().await;
-        let give_up = Instant::now() + self.resume_within;
-        let mut pause = Duration::from_millis(5);
+        let (mut give_up, mut pause) = (None, Duration::from_millis(5));
         loop {
-            let error = match self.try_call(&request).await {
+            let error = match self.try_call(ask).await {
                 Ok(response) => return Ok(response),
                 Err(error) => error,
             };
+            // The clock is asked once something is wrong.
+            let give_up = *give_up.get_or_insert_with(|| Instant::now() + self.resume_within);
             if !error.retry || Instant::now() + pause > give_up {
                 return Err(error.error);
             }
@@ -296,25 +221,25 @@ impl Session {
         }
     }
 
-    async fn try_call(&mut self, request: &Request) -> Result<Response, Attempt> {
+    async fn try_call(&mut self, ask: Ask<'_>) -> Result<Response, Attempt> {
         if self.closed {
             let message = "the environment was closed".into();
             return Err(Attempt::last(ClientError::Argument { field: "session_id", message }));
         }
         let fresh = self.open.is_none();
-        let message = self.message(request);
         // Nothing was sent yet: whatever fails here may be tried again.
-        let open = self.stream().await.map_err(|status| Attempt { retry: is_broken(&status), error: status.into() })?;
-        if !open.send(message).await {
+        let stream = self.stream().await;
+        let (open, id) = stream.map_err(|status| Attempt { retry: is_broken(&status), error: status.into() })?;
+        if open.send(ask, id).await != Sent::Yes {
             self.open = None;
-            let error = ClientError::Interrupted { request: name(request), message: "the stream ended".into() };
+            let error = ClientError::Interrupted { request: ask.name(), message: "the stream ended".into() };
             return Err(Attempt { retry: true, error });
         }
-        let broken = |message: String| Attempt {
-            retry: repeatable(request),
-            error: ClientError::Interrupted { request: name(request), message },
-        };
-        match open.answer().await {
+        let answer = open.answer().await;
+        let retry = !matches!(answer, Ok(Some(_))) && (ask.is_repeatable() || open.is_unsent());
+        let broken =
+            |message: String| Attempt { retry, error: ClientError::Interrupted { request: ask.name(), message } };
+        match answer {
             Ok(Some(pb::InteractResponse { response: Some(response) })) => {
                 open.awaited -= 1;
                 Ok(response)
@@ -360,8 +285,7 @@ impl Session {
         if self.closed {
             return Ok(());
         }
-        let request = Request::Close(pb::CloseSessionRequest::default());
-        let outcome = self.call(request).await;
+        let outcome = self.call(Ask::Close).await;
         (self.closed, self.open) = (true, None);
         match outcome {
             Ok(_) => Ok(()),
@@ -382,9 +306,8 @@ impl Drop for Session {
         let (open, id, mut service) = (self.open.take(), std::mem::take(&mut self.id), self.connection.service.clone());
         runtime.spawn(async move {
             // Our half of the stream ends first, and then the server's, which puts the session back.
-            if let Some(Open { requests, mut answers, .. }) = open {
-                drop(requests);
-                while let Ok(Some(_)) = answers.message().await {}
+            if let Some(open) = open {
+                open.finish().await;
             }
             let _ = service.close_session(pb::CloseSessionRequest { session_id: id }).await;
         });

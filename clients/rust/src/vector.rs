@@ -6,9 +6,10 @@ use crate::{
     packed::{Packed, pack},
     session::{RenderMode, Session},
     spec::InfoColumn,
+    stream::Ask,
 };
 use bytes::Bytes;
-use mazeway_proto::env::{self as pb, interact_request::Request, interact_response::Response};
+use mazeway_proto::env::{self as pb, interact_response::Response};
 use std::{sync::Arc, time::Duration};
 
 /// How the environments of a reset are seeded.
@@ -169,7 +170,7 @@ impl VectorEnv {
             Seeds::Each(seeds) => (None, pack(seeds)),
         };
         let request = pb::ResetRequest { session_id: String::new(), seed, seeds, reset_mask };
-        match self.session.call(Request::Reset(request)).await? {
+        match self.session.call(Ask::Reset(&request)).await? {
             Response::Reset(answer) => self.reset_batch(answer.observations, answer.infos),
             _ => Err(ClientError::protocol("expected the answer to a reset")),
         }
@@ -180,7 +181,7 @@ impl VectorEnv {
     /// # Errors
     /// Another number of actions, an action out of range, no reset yet, a connection that broke during the step.
     pub async fn step(&mut self, actions: &[u32]) -> Result<StepBatch, ClientError> {
-        let answer = self.session.call(Self::step_request(actions)).await?;
+        let answer = self.session.call(Ask::Step(actions)).await?;
         self.step_batch(answer)
     }
 
@@ -190,8 +191,7 @@ impl VectorEnv {
     /// # Errors
     /// Too many are under way; the stream has ended.
     pub async fn send_step(&mut self, actions: &[u32]) -> Result<(), ClientError> {
-        self.session.send(&Self::step_request(actions)).await?;
-        Ok(())
+        self.session.send(Ask::Step(actions)).await
     }
 
     /// What came of the oldest actions that were sent and not yet received.
@@ -201,10 +201,6 @@ impl VectorEnv {
     pub async fn receive_step(&mut self) -> Result<StepBatch, ClientError> {
         let answer = self.session.receive().await?;
         self.step_batch(answer)
-    }
-
-    fn step_request(actions: &[u32]) -> Request {
-        Request::Step(pb::StepRequest { session_id: String::new(), actions: pack(actions.iter().copied()) })
     }
 
     fn reset_batch(&self, observations: Bytes, infos: Vec<Bytes>) -> Result<ResetBatch, ClientError> {

@@ -1,13 +1,16 @@
 //! The gRPC face: decoding, calling, encoding, and nothing that computes.
 
+mod aside;
 mod connections;
 mod from_proto;
 pub(crate) mod host;
 pub(crate) mod interact;
+mod reply;
 mod serve;
 mod service;
 mod status;
 mod to_proto;
+mod workers;
 
 pub use serve::{ServeError, serve};
 pub use status::CallError;

@@ -1,17 +1,19 @@
 //! A server from a listener to its shutdown.
 
-use super::{connections::at_most, host::Host, service::EnvironmentGrpc};
-use crate::{config::Config, dm_env};
+use super::{connections::Gate, host::Host, interact::Environments, service::EnvironmentGrpc, workers::Worker};
+use crate::{config::Config, dm_env, listen::Listener};
+use futures_util::{StreamExt as _, stream::FuturesUnordered};
 use mazeway_proto::env::environment_service_server::EnvironmentServiceServer;
-use std::{future::Future, sync::Arc, time::Duration};
-use tokio::{net::TcpListener, time::timeout};
+use std::{future::Future, io, sync::Arc, time::Duration};
 use tokio_util::sync::CancellationToken;
-use tonic::transport::{Server, server::TcpIncoming};
+use tonic::{service::Routes, transport::Server};
 
 /// Bytes of a stream that may wait for their reader: some steps of the largest batch.
 const STREAM_WINDOW_BYTES: u32 = 1 << 20;
 /// Bytes of all streams of a connection that may wait: so many that a few blocked streams do not hold up the others.
 const CONNECTION_WINDOW_BYTES: u32 = 16 << 20;
+/// Largest frame taken in: a batch of actions comes in one.
+const FRAME_BYTES: u32 = 256 << 10;
 /// Time that a peer has to answer a ping.
 const PING_TIMEOUT: Duration = Duration::from_secs(10);
 
@@ -24,36 +26,24 @@ pub enum ServeError {
     /// The descriptors of the protocol cannot be read.
     #[error("server reflection cannot read the descriptors: {0}")]
     Reflection(#[from] tonic_reflection::server::Error),
+    /// There are no threads to serve on.
+    #[error("no threads to serve connections: {0}")]
+    Threads(io::Error),
 }
 
 /// Serves environments, health and reflection on `listener` until `shutdown` is ready, then lets running calls end for
 /// [`Config::shutdown_grace`]. Interactive streams are told to go at once.
 ///
 /// # Errors
-/// The transport fails.
+/// The transport fails; there are no threads.
 pub async fn serve(
     config: Config,
-    listener: TcpListener,
+    listener: impl Into<Listener>,
     shutdown: impl Future<Output = ()>,
 ) -> Result<(), ServeError> {
     let stopping = CancellationToken::new();
-    // Whatever way this ends, the reaper and the streams learn of it.
+    // Whatever way this ends, the reaper, the workers and the streams learn of it.
     let _stop = stopping.clone().drop_guard();
-    let (max_message_bytes, grace) = (config.max_message_bytes, config.shutdown_grace);
-    let max_connections = config.max_connections;
-    let mut builder = Server::builder()
-        .http2_keepalive_interval(Some(config.keepalive))
-        .http2_keepalive_timeout(Some(PING_TIMEOUT))
-        .initial_stream_window_size(STREAM_WINDOW_BYTES)
-        .initial_connection_window_size(CONNECTION_WINDOW_BYTES)
-        .max_concurrent_streams(config.max_streams_per_connection)
-        .concurrency_limit_per_connection(config.max_streams_per_connection as usize);
-    let host = Arc::new(Host::new(config, stopping.clone()));
-    let environments = EnvironmentServiceServer::new(EnvironmentGrpc(Arc::clone(&host)))
-        .max_decoding_message_size(max_message_bytes)
-        // A reply's packed arrays are within the limit; their frame comes on top.
-        .max_encoding_message_size(max_message_bytes + 4096);
-    let worlds = dm_env::EnvironmentServer(Arc::clone(&host));
     let (health, health_service) = tonic_health::server::health_reporter();
     health.set_serving::<EnvironmentServiceServer<EnvironmentGrpc>>().await;
     health.set_serving::<dm_env::EnvironmentServer>().await;
@@ -63,26 +53,52 @@ pub async fn serve(
             .register_encoded_file_descriptor_set(mazeway_proto::DM_ENV_RPC_FILE_DESCRIPTOR_SET)
             .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
     };
-    let router = builder
-        .add_service(environments)
-        .add_service(worlds)
+    let gate = Gate::new(listener.into(), config.max_connections);
+    let (server, threads, grace) = (transport(&config), config.threads(), config.shutdown_grace);
+    let host = Arc::new(Host::new(config, stopping.clone()));
+    let routes = Routes::new(Environments::new(&host))
+        .add_service(dm_env::EnvironmentServer(Arc::clone(&host)))
         .add_service(health_service)
         .add_service(reflection().build_v1()?)
-        .add_service(reflection().build_v1alpha()?);
-    let incoming = at_most(max_connections, TcpIncoming::from(listener).with_nodelay(Some(true)));
-    let serving = router.serve_with_incoming_shutdown(incoming, stopping.clone().cancelled_owned());
-    tokio::pin!(serving);
+        .add_service(reflection().build_v1alpha()?)
+        .prepare();
+    let start = |_| Worker::start(server.clone(), routes.clone(), stopping.clone(), grace);
+    let mut workers = (0..threads).map(start).collect::<Result<Vec<_>, _>>()?;
     let reaper = tokio::spawn(host.reap_sessions());
-    let outcome = tokio::select! {
-        outcome = &mut serving => outcome,
-        () = shutdown => {
-            health.set_not_serving::<EnvironmentServiceServer<EnvironmentGrpc>>().await;
-            health.set_not_serving::<dm_env::EnvironmentServer>().await;
-            stopping.cancel();
-            // Calls that need longer are cut off.
-            timeout(grace, serving).await.unwrap_or(Ok(()))
+    let hand_over = async {
+        loop {
+            let connection = gate.next().await;
+            if let Some(worker) = workers.iter().min_by_key(|worker| worker.load()) {
+                worker.give(connection);
+            }
         }
     };
+    tokio::select! {
+        () = hand_over => {}
+        () = shutdown => {}
+    }
+    health.set_not_serving::<EnvironmentServiceServer<EnvironmentGrpc>>().await;
+    health.set_not_serving::<dm_env::EnvironmentServer>().await;
+    // Nobody is let in any more, and a Unix socket is gone, before running calls are waited for.
+    drop(gate);
+    stopping.cancel();
+    let mut ends: FuturesUnordered<_> = workers.iter_mut().map(Worker::ended).collect();
+    let mut outcome = Ok(());
+    while let Some(end) = ends.next().await {
+        outcome = outcome.and(end);
+    }
     reaper.abort();
-    Ok(outcome?)
+    outcome
+}
+
+/// Settings of HTTP/2.
+fn transport(config: &Config) -> Server {
+    Server::builder()
+        .http2_keepalive_interval(Some(config.keepalive))
+        .http2_keepalive_timeout(Some(PING_TIMEOUT))
+        .initial_stream_window_size(STREAM_WINDOW_BYTES)
+        .initial_connection_window_size(CONNECTION_WINDOW_BYTES)
+        .max_frame_size(FRAME_BYTES)
+        .max_concurrent_streams(config.max_streams_per_connection)
+        .concurrency_limit_per_connection(config.max_streams_per_connection as usize)
 }

@@ -29,7 +29,7 @@ pub struct EnvironmentGrpc(pub Arc<Host>);
 
 #[tonic::async_trait]
 impl EnvironmentService for EnvironmentGrpc {
-    type InteractStream = Answers<pb::InteractResponse>;
+    type InteractStream = stream::Empty<Result<pb::InteractResponse, Status>>;
     type RolloutStream = Answers<pb::RolloutResponse>;
     type GetModelStream = Answers<pb::GetModelResponse>;
 
@@ -62,21 +62,22 @@ impl EnvironmentService for EnvironmentGrpc {
             let (seeds, mask) = from_proto::reset(&request)?;
             Ok(to_proto::reset(batch.reset(seeds, mask)?))
         });
-        Ok(Response::new(work.await?.1?))
+        Ok(Response::new(work.await?))
     }
 
     async fn step(&self, request: Request<pb::StepRequest>) -> Result<Response<pb::StepResponse>, Status> {
         let request = request.into_inner();
         let guard = self.0.take(from_proto::session_id(&request.session_id)?)?;
         let work = interact::run(guard, move |batch| Ok(to_proto::step(batch.step(&request.actions)?)));
-        Ok(Response::new(work.await?.1?))
+        Ok(Response::new(work.await?))
     }
 
+    /// Never called: [`interact::Environments`] answers it without the detour over messages.
     async fn interact(
         &self,
-        request: Request<Streaming<pb::InteractRequest>>,
+        _request: Request<Streaming<pb::InteractRequest>>,
     ) -> Result<Response<Self::InteractStream>, Status> {
-        Ok(Response::new(Box::pin(interact::interact(Arc::clone(&self.0), request.into_inner()))))
+        Err(CallError::Internal("expected the fast path to take this call".into()).into())
     }
 
     async fn rollout(&self, request: Request<pb::RolloutRequest>) -> Result<Response<Self::RolloutStream>, Status> {

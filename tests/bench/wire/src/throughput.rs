@@ -4,7 +4,8 @@ use crate::{
     Setting,
     figures::{Report, Subject, in_rounds, mode_name},
     peers::{Bidi, Peers, Tonic},
-    round_trips::{current_thread, endless, server, sizes},
+    process::Process,
+    round_trips::{current_thread, endless, sizes},
 };
 use mazeway_client::{Autoreset, VectorEnv};
 use serde_json::json;
@@ -23,8 +24,8 @@ async fn vector_env(address: &str, env_id: &str, num_envs: u32) -> VectorEnv {
 }
 
 pub fn pipelined(setting: &Setting, report: &mut Report) {
-    let (request, reply) = sizes("Maze-v0", 1);
-    let (peers, server, runtime) = (Peers::start(), server(setting, "127.0.0.1:0"), current_thread());
+    let (peers, server, runtime) = (Peers::start(), Process::server(setting, "127.0.0.1:0"), current_thread());
+    let (request, reply) = runtime.block_on(sizes(server.address(), "Maze-v0", 1));
     let mut bidi: Bidi = runtime.block_on(async {
         let mut bidi = Tonic::connect(&peers.tonic_tcp, request, reply).await.bidi(IN_FLIGHT).await;
         for _ in 0..IN_FLIGHT {
@@ -65,10 +66,10 @@ pub fn pipelined(setting: &Setting, report: &mut Report) {
 }
 
 pub fn batches(setting: &Setting, report: &mut Report) {
-    let (peers, server, runtime) = (Peers::start(), server(setting, "127.0.0.1:0"), current_thread());
+    let (peers, server, runtime) = (Peers::start(), Process::server(setting, "127.0.0.1:0"), current_thread());
     for env_id in ["Maze-v0", "Highway-v0"] {
         for num_envs in BATCHES {
-            let (request, reply) = sizes(env_id, num_envs as usize);
+            let (request, reply) = runtime.block_on(sizes(server.address(), env_id, num_envs));
             let mut envs = runtime.block_on(vector_env(server.address(), env_id, num_envs));
             let actions: Vec<u32> = (0..num_envs).map(|env| env % envs.spec().n_actions).collect();
             let mut bidi =

@@ -1,6 +1,6 @@
 //! What a remote step costs beside the loopback itself and beside a bare gRPC stream; how that scales; what memory it takes.
 //!
-//! `cargo bench -p mazeway-tests --bench wire -- [--json FILE] [--modes pinned,idle] [--parts round_trips,…] [--quick]`
+//! `cargo run --release -p mazeway-bench-wire -- [--json FILE] [--modes pinned,idle] [--parts round_trips,…] [--quick]`
 //!
 //! Client and server are processes of their own: the binary `server` and, for everything else, this program started again.
 //! All peers of a table are measured in turn, in rounds, so that what disturbs the machine disturbs them alike; a figure is
@@ -28,6 +28,7 @@
 mod figures;
 mod memory;
 mod peers;
+mod process;
 mod round_trips;
 mod throughput;
 
@@ -84,9 +85,6 @@ struct Cli {
     /// Serves the peers.
     #[arg(long, hide = true)]
     serve_peers: bool,
-    /// Passed by cargo.
-    #[arg(long, hide = true)]
-    bench: bool,
 }
 
 /// What a part needs to know.

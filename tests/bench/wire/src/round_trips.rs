@@ -4,35 +4,21 @@ use crate::{
     Setting,
     figures::{Report, Subject, in_rounds, mode_name},
     peers::{Peers, Raw, Tonic},
+    process::Process,
 };
-use mazeway_client::{Autoreset, Connection, Env, SessionOptions, VectorEnv, channel, packed::pack};
+use mazeway_client::{Env, SessionOptions, channel, packed::pack};
 use mazeway_proto::env::{
     self as pb, environment_service_client::EnvironmentServiceClient, interact_request, interact_response,
 };
-use mazeway_server::{
-    batch::{self, BatchOptions, Layout},
-    registry::Registry,
-};
-use mazeway_tests::programs::Service;
 use prost::Message as _;
-use serde_json::{Map, json};
-use std::{process::Command, sync::Arc};
+use serde_json::json;
+use std::sync::Arc;
 use tokio::{runtime::Runtime, sync::Mutex};
+use tonic::transport::Channel;
 
 /// Episodes that never end by the clock.
 pub fn endless() -> SessionOptions {
     SessionOptions { max_episode_steps: Some(0), ..SessionOptions::default() }
-}
-
-/// A server without limits that would get in the way.
-pub fn server(setting: &Setting, listen: &str) -> Service {
-    let mut command = Command::new(&setting.server);
-    command.args(["--listen", listen, "--max-envs-per-session", "65536", "--max-total-envs", "1000000"]);
-    command.args(["--max-sessions", "20000", "--max-connections", "20000", "--default-lease-secs", "3000"]);
-    for (name, _) in std::env::vars().filter(|(name, _)| name.starts_with("MAZEWAY_")) {
-        command.env_remove(name);
-    }
-    Service::start(command)
 }
 
 pub fn current_thread() -> Runtime {
@@ -40,22 +26,14 @@ pub fn current_thread() -> Runtime {
 }
 
 /// Bytes of a step's request and of its answer, as the messages of the protocol, without gRPC's frame.
-pub fn sizes(env_id: &str, num_envs: usize) -> (usize, usize) {
-    let environment = Registry::new().configure(env_id, &Map::new()).expect("an environment");
-    let autoreset = batch::Autoreset::NextStep;
-    let options = BatchOptions { num_envs, autoreset, max_episode_steps: 0, action_masks: false };
-    let layout = Layout::of(environment.spec(), options);
-    let zeros = |range: &std::ops::Range<usize>| vec![0; range.len()].into();
-    let answer = pb::StepResponse {
-        observations: zeros(&layout.observations),
-        rewards: zeros(&layout.rewards),
-        terminated: zeros(&layout.terminated),
-        truncated: zeros(&layout.truncated),
-        infos: layout.infos.iter().map(zeros).collect(),
-        ..Default::default()
-    };
-    let request = pb::StepRequest { session_id: String::new(), actions: vec![0; 4 * num_envs].into() };
-    let request = pb::InteractRequest { request: Some(interact_request::Request::Step(request)) };
+pub async fn sizes(address: &str, env_id: &str, num_envs: u32) -> (usize, usize) {
+    let (mut service, session_id) = unary(address, env_id, num_envs).await;
+    let mut step = pb::StepRequest { session_id: session_id.clone(), actions: vec![0; 4 * num_envs as usize].into() };
+    let answer = service.step(step.clone()).await.expect("steps").into_inner();
+    service.close_session(pb::CloseSessionRequest { session_id }).await.expect("closes");
+    // On a stream, all but the first message leave it out.
+    step.session_id.clear();
+    let request = pb::InteractRequest { request: Some(interact_request::Request::Step(step)) };
     let answer = pb::InteractResponse { response: Some(interact_response::Response::Step(answer)) };
     (request.encoded_len(), answer.encoded_len())
 }
@@ -66,27 +44,26 @@ async fn open(address: &str) -> Env {
     env
 }
 
-/// The RPC `Step`.
-async fn unary(address: &str) -> (EnvironmentServiceClient<tonic::transport::Channel>, String) {
-    let connection = Connection::open(address).await.expect("connects");
-    let make = VectorEnv::create(&connection, "Maze-v0", 1, Autoreset::NextStep, endless());
-    let made = make.await.expect("a session");
-    let id = made.session_id().to_owned();
-    // The session must live on without its maker, which would end it.
-    std::mem::forget(made);
-    let mut service = EnvironmentServiceClient::new(channel(address).await.expect("connects"));
-    let reset = pb::ResetRequest { session_id: id.clone(), seed: Some(1), ..Default::default() };
+/// A session for unary calls, after its reset.
+async fn unary(address: &str, env_id: &str, num_envs: u32) -> (EnvironmentServiceClient<Channel>, String) {
+    let channel = channel(address).await.expect("connects");
+    let mut service = EnvironmentServiceClient::new(channel).max_decoding_message_size(64 << 20);
+    let make =
+        pb::CreateSessionRequest { env_id: env_id.into(), num_envs, max_episode_steps: Some(0), ..Default::default() };
+    let session_id = service.create_session(make).await.expect("a session").into_inner().session_id;
+    let reset = pb::ResetRequest { session_id: session_id.clone(), seed: Some(1), ..Default::default() };
     service.reset(reset).await.expect("resets");
-    (service, id)
+    (service, session_id)
 }
 
 pub fn measure(setting: &Setting, report: &mut Report) {
-    let (request, reply) = sizes("Maze-v0", 1);
-    let peers = Peers::start();
-    let tcp = server(setting, "127.0.0.1:0");
+    let (peers, tcp) = (Peers::start(), Process::server(setting, "127.0.0.1:0"));
+    let directory = tempfile::tempdir().expect("a directory");
+    let unix = Process::server(setting, &format!("unix:{}", directory.path().join("server.sock").display()));
     let runtime = current_thread();
     let multi = tokio::runtime::Builder::new_multi_thread().enable_all().build().expect("a runtime");
 
+    let (request, reply) = runtime.block_on(sizes(tcp.address(), "Maze-v0", 1));
     // A gRPC message has five bytes before it; the sockets carry them too.
     let mut raw_tcp = Raw::tcp(&peers.raw_tcp, request + 5, reply + 5);
     let mut raw_unix = Raw::unix(&peers.raw_unix, request + 5, reply + 5);
@@ -95,8 +72,9 @@ pub fn measure(setting: &Setting, report: &mut Report) {
     let mut bidi_multi = bidi(&peers.tonic_multi_thread);
     let mut unary_tcp = runtime.block_on(Tonic::connect(&peers.tonic_tcp, request, reply));
     let mut env_tcp = runtime.block_on(open(tcp.address()));
+    let mut env_unix = runtime.block_on(open(unix.address()));
     let env_multi = Arc::new(Mutex::new(multi.block_on(open(tcp.address()))));
-    let (mut service, id) = runtime.block_on(unary(tcp.address()));
+    let (mut service, id) = runtime.block_on(unary(tcp.address(), "Maze-v0", 1));
 
     let mut subjects = [
         Subject::new("raw_tcp", |times| (0..times).for_each(|_| raw_tcp.round_trip())),
@@ -112,6 +90,7 @@ pub fn measure(setting: &Setting, report: &mut Report) {
             });
         }),
         Subject::new("env_step_tcp", |times| runtime.block_on(steps(&mut env_tcp, times))),
+        Subject::new("env_step_unix", |times| runtime.block_on(steps(&mut env_unix, times))),
         // On a task of the runtime, as a program under #[tokio::main] that spawns its work.
         Subject::new("env_step_tcp_multi_thread", |times| {
             let env = Arc::clone(&env_multi);

@@ -1,6 +1,6 @@
 //! What Mazeway's wire is compared with: plain sockets, and bare gRPC that carries as many bytes.
 
-use mazeway_tests::programs::Service as Process;
+use crate::process::Process;
 use std::{
     io::{Read, Write},
     net::{TcpListener, TcpStream},
@@ -42,10 +42,7 @@ impl Peers {
     pub fn start() -> Self {
         let directory = tempfile::tempdir().expect("a directory");
         let mut command = Command::new(std::env::current_exe().expect("a path of this program"));
-        let process = Process::start({
-            command.arg("--serve-peers").current_dir(&directory);
-            command
-        });
+        let process = Process::start(command.arg("--serve-peers").current_dir(&directory));
         let mut addresses = process.address().split(' ').map(str::to_owned);
         let mut next = || addresses.next().expect("an address");
         let (raw_tcp, tonic_tcp, tonic_multi_thread) = (next(), next(), next());

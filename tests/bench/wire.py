@@ -11,7 +11,7 @@ machine disturbs them all. Medians over the rounds, with the lowest and the high
 Peers: a bare TCP ping-pong in Python (the floor); Gymnasium's own wrappers around an environment that does nothing; bare
 echoes by grpcio; dm_env_rpc's and OpenEnv's own servers and clients around a toy; EnvPool's FrozenLake and highway-fast,
 Gymnasium's vector environments and highway-env in process. Rust's own figures, and the floor of blocking sockets in Rust,
-are those of `cargo bench -p mazeway-tests --bench wire -- --parts round_trips`, run in between.
+are those of `cargo run --release -p mazeway-bench-wire -- --parts round_trips`, run in between.
 
 FrozenLake (16 states) is compared with the maze (57 states), highway-fast (continuous kinematics, 3 lanes, fewer vehicles
 and simulation steps than highway-v0) with our highway (12 vehicles, one decision a second): by what a user gets a second,
@@ -173,10 +173,10 @@ def run(python, binary, cases, rounds, secs, pin):
 
 def rust_figures(binary, rounds):
     """Round trips by mode and name, as the Rust benchmark measures them; none where it is not there."""
-    if not (REPOSITORY / "tests" / "benches" / "wire" / "main.rs").is_file():
+    if not (REPOSITORY / "tests" / "bench" / "wire" / "Cargo.toml").is_file():
         return {}
     log("measuring round trips of the Rust client")
-    command = ["cargo", "bench", "-q", "-p", "mazeway-tests", "--bench", "wire", "--", "--json", "-"]
+    command = ["cargo", "run", "-q", "--release", "-p", "mazeway-bench-wire", "--", "--json", "-"]
     command += ["--parts", "round_trips", "--rounds", str(rounds), "--server", binary]
     done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False)
     if done.returncode:

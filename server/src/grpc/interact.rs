@@ -180,7 +180,8 @@ impl http_body::Body for Interaction {
                     Err(error) => this.end(CallError::Internal(error.to_string()).into()),
                 }
             }
-            if this.out.len() >= FRAME_BYTES {
+            // Also what a request waits for that is to be answered on another thread.
+            if this.out.len() >= FRAME_BYTES || (this.waiting.is_some() && !this.out.is_empty()) {
                 return this.fetch();
             }
             match &this.phase {

@@ -208,7 +208,13 @@ impl http_body::Body for Interaction {
                 Poll::Ready(None) => this.end(Status::new(tonic::Code::Ok, "")),
                 Poll::Pending if !this.out.is_empty() => return this.fetch(),
                 // Requests come first: the rest is looked at only when none is waiting.
-                Poll::Pending if this.aside.has_rung(cx) => this.look_aside(),
+                Poll::Pending if this.aside.has_rung(cx) => {
+                    this.look_aside();
+                    if matches!(this.phase, Phase::Reading) {
+                        // Should it have rung meanwhile, it has woken this task.
+                        return Poll::Pending;
+                    }
+                }
                 Poll::Pending => return Poll::Pending,
             }
         }

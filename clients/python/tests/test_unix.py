@@ -62,5 +62,5 @@ def test_the_socket_goes_with_its_server(socket):
         for _ in range(100):
             env.step(0)
     env.close()
-    with pytest.raises(mazeway.MazewayError, match="env.sock"):
+    with pytest.raises(mazeway.MazewayError, match=r"env\.sock"):
         gymnasium.make("mazeway/Maze-v0", address=socket.address).reset(seed=1)

@@ -191,6 +191,7 @@ struct Incoming {
 }
 
 #[derive(Debug)]
+#[expect(clippy::large_enum_variant, reason = "one a stream, and open for nearly all of its life")]
 enum State {
     Opening(JoinHandle<Result<Streaming<Bytes>, Failure>>),
     Open(Streaming<Bytes>),

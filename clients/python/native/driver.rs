@@ -33,7 +33,7 @@ const SILENCE: Duration = Duration::from_secs(1);
 /// Times that a connection's tasks are run to take in and send out what is there.
 const TURNS: usize = 8;
 /// Longest wait: beyond it nobody can tell.
-const LONGEST: Duration = Duration::from_secs(365 * 24 * 3600);
+const LONGEST: Duration = Duration::from_hours(365 * 24);
 
 /// Why a wait ended without a result.
 #[derive(Debug)]

@@ -123,7 +123,9 @@ impl WorldError {
     /// The field of the request, as a path in the words of this protocol, where one is to blame.
     pub fn field(&self) -> Option<String> {
         match self {
-            Self::Call(CallError::Malformed { field, .. }) => Some(field.clone()),
+            Self::Call(CallError::Malformed { field, .. }) | Self::SpecsWouldChange { field, .. } => {
+                Some(field.clone())
+            }
             Self::Call(CallError::Batch(BatchError::ActionOutOfRange { .. } | BatchError::ActionsLength { .. })) => {
                 Some("actions[1]".into())
             }
@@ -133,7 +135,6 @@ impl WorldError {
                 "sessions" => "worlds".into(),
                 _ => format!("settings.{field}"),
             }),
-            Self::SpecsWouldChange { field, .. } => Some(field.clone()),
             Self::DestroyJoined | Self::Occupied | Self::AgentSilent { .. } => Some("world_name".into()),
             Self::UnknownProperty { .. } | Self::PropertyDenied { .. } | Self::NotListable { .. } | Self::NoSeed => {
                 Some("key".into())

@@ -86,7 +86,7 @@ impl Specs {
         let none = (None, None);
         match &spec.observation_space {
             Space::Discrete { n } => {
-                let bounds = (int32s(0), int32s(n.saturating_sub(1) as i32));
+                let bounds = (Some(int32s(0)), Some(int32s(n.saturating_sub(1) as i32)));
                 add(Source::Observation, "observation".into(), DataType::Int32, &[], bounds);
             }
             Space::Box { shape, low, high } => {
@@ -103,7 +103,7 @@ impl Specs {
         add(Source::Terminated, "terminated".into(), DataType::Bool, &[], none.clone());
         add(Source::Truncated, "truncated".into(), DataType::Bool, &[], none.clone());
         for (rank, column) in world.info_columns().iter().enumerate() {
-            let bounds = if column.name == ACTION_MASK { (uint8s(0), uint8s(1)) } else { none.clone() };
+            let bounds = if column.name == ACTION_MASK { (Some(uint8s(0)), Some(uint8s(1))) } else { none.clone() };
             add(Source::Info(rank), format!("info.{}", column.name), data_type(column.dtype), &column.shape, bounds);
         }
         debug_assert!(observations.len() <= MAX_OBSERVATIONS, "an observation without a bit");
@@ -111,8 +111,8 @@ impl Specs {
             name: "action".into(),
             shape: whole(&[]),
             dtype: DataType::Int32.into(),
-            min: int32s(0),
-            max: int32s(spec.n_actions.saturating_sub(1) as i32),
+            min: Some(int32s(0)),
+            max: Some(int32s(spec.n_actions.saturating_sub(1) as i32)),
         };
         Self { batch, action, observations }
     }
@@ -259,12 +259,12 @@ fn data_type(dtype: DType) -> DataType {
     }
 }
 
-fn int32s(value: i32) -> Option<Value> {
-    Some(Value { payload: Some(Payload::Int32s(Int32Array { array: vec![value] })) })
+fn int32s(value: i32) -> Value {
+    Value { payload: Some(Payload::Int32s(Int32Array { array: vec![value] })) }
 }
 
-fn uint8s(value: u8) -> Option<Value> {
-    Some(Value { payload: Some(Payload::Uint8s(Uint8Array { array: vec![value].into() })) })
+fn uint8s(value: u8) -> Value {
+    Value { payload: Some(Payload::Uint8s(Uint8Array { array: vec![value].into() })) }
 }
 
 fn floats(array: Vec<f32>) -> Option<Value> {

@@ -267,13 +267,16 @@ fn names(connection: &Connection) -> HashMap<i64, String> {
     names
 }
 
-/// Reads a trajectory and when it was recorded, and checks it against what it was stored with. An error comes with its id where that reads.
+/// An error, and the id of the trajectory that it is about where that reads.
+type Unreadable = (Option<String>, StoreError);
+
+/// Reads a trajectory and when it was recorded, and checks it against what it was stored with.
 fn trajectory(
     connection: &Connection,
     path: &Path,
     collections: &mut HashMap<i64, Collection>,
     seq: i64,
-) -> Result<Option<(i64, Recording)>, (Option<String>, StoreError)> {
+) -> Result<Option<(i64, Recording)>, Unreadable> {
     let mut id = None;
     let read = (|| {
         let sql = "SELECT trajectory_id, collection, recorded_at, seed, steps, final_state, terminated, truncated, \

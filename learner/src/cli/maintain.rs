@@ -115,9 +115,9 @@ async fn blocking<T: Send + 'static>(
 fn tell(as_json: bool, value: &Value, text: &str) -> Result<(), CliError> {
     let mut out = std::io::stdout().lock();
     if as_json {
-        writeln!(out, "{value}")?
+        writeln!(out, "{value}")?;
     } else {
-        write!(out, "{text}")?
+        write!(out, "{text}")?;
     }
     Ok(out.flush()?)
 }
@@ -139,11 +139,11 @@ fn text(found: &Verification) -> String {
         text += "structure   sound\n";
     }
     for finding in found.structure.iter().take(NAMED) {
-        text += &format!("structure   {}\n", finding.split_whitespace().collect::<Vec<_>>().join(" "));
+        text.extend(["structure   ", &finding.split_whitespace().collect::<Vec<_>>().join(" "), "\n"]);
     }
     let row = |what: &str, tally: Tally| [what.to_owned(), tally.sound.to_string(), tally.damaged.to_string()];
     let rows = [row("trajectories", found.trajectories), row("models", found.models), row("fits", found.fits)];
-    text += &format!("\n{}\n\n", table(["what", "#sound", "#damaged"], rows));
+    text.extend(["\n", &table(["what", "#sound", "#damaged"], rows).to_string(), "\n\n"]);
     if !found.damage.is_empty() {
         let rows = found.damage.iter().take(NAMED).map(|damage| {
             let kind = match damage.kind {
@@ -153,9 +153,9 @@ fn text(found: &Verification) -> String {
             };
             [kind.to_owned(), damage.name.clone(), damage.message.clone()]
         });
-        text += &format!("{}\n", table(["damaged", "which", "why"], rows));
+        text.extend([&table(["damaged", "which", "why"], rows).to_string(), "\n"]);
         if found.damage.len() > NAMED {
-            text += &format!("and {} more; --json names them\n", found.damage.len() - NAMED);
+            text.extend(["and ", &(found.damage.len() - NAMED).to_string(), " more; --json names them\n"]);
         }
         text.push('\n');
     }

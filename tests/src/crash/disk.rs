@@ -227,7 +227,9 @@ impl Disk {
             Luck::Some => below(rng, pending_names.len() + 1),
         };
         pending_names.into_iter().take(kept).for_each(|(name, file)| rename(&mut names, name, file));
-        files.iter_mut().for_each(|file| file.settle(Some(luck), rng));
+        for file in &mut files {
+            file.settle(Some(luck), rng);
+        }
         names.into_iter().map(|(name, file)| (name, std::mem::take(&mut files[file].content))).collect()
     }
 }

@@ -237,7 +237,9 @@ impl<'a> Subject<'a> {
             }
             Outcome::Failed(possible) => {
                 self.tally.failed_steps += 1;
-                possible.iter().for_each(|contents| add(&mut allowed, Rc::clone(contents)));
+                for contents in &possible {
+                    add(&mut allowed, Rc::clone(contents));
+                }
                 self.within(from, to, allowed.clone());
                 self.allowed = allowed;
                 self.visible = self.look(&possible)?;

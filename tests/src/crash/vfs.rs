@@ -268,6 +268,7 @@ struct IndexHandle {
 }
 
 impl WalIndex for IndexHandle {
+    #[expect(clippy::large_stack_arrays, reason = "a region is small beside a thread's stack")]
     fn map(&mut self, region: u32) -> Result<[u8; REGION_BYTES], Error> {
         Ok(**lock(&self.index).regions.entry(region).or_insert_with(|| Box::new([0; REGION_BYTES])))
     }
@@ -302,6 +303,7 @@ impl WalIndex for IndexHandle {
         Ok(())
     }
 
+    #[expect(clippy::large_stack_arrays, reason = "a region is small beside a thread's stack")]
     fn push(&mut self, region: u32, data: &[u8; REGION_BYTES]) -> Result<(), Error> {
         **lock(&self.index).regions.entry(region).or_insert_with(|| Box::new([0; REGION_BYTES])) = *data;
         Ok(())

@@ -264,7 +264,9 @@ fn model_messages() -> Vec<Vec<u8>> {
     let header = ModelHeader { env_id: "Test-v0".into(), n_states: 2, n_actions: 1, ..ModelHeader::default() };
     let rows = [store::pack_u32(&[2, 1]), store::pack_u32(&[0, 1, 1]), store::pack_f64(&[0.5, 0.5, 1.0])];
     let mut input = vec![4 * 2, 4 * 3, 8 * 3];
-    rows.iter().for_each(|row| input.extend(&row[..]));
+    for row in &rows {
+        input.extend(&row[..]);
+    }
     input.extend(header.encode_to_vec());
     vec![input]
 }

@@ -17,7 +17,9 @@ fn what_was_acknowledged_survives_every_cut_of_the_power() {
     let parts = (seed * PARTS..(seed + 1) * PARTS).into_par_iter();
     let tallies = parts.map(|part| run(part, cuts / PARTS, OLD, false)).collect::<Vec<_>>();
     let mut sum = Tally::default();
-    tallies.into_iter().for_each(|tally| sum += tally.unwrap_or_else(|error| panic!("{error}")));
+    for tally in tallies {
+        sum += tally.unwrap_or_else(|error| panic!("{error}"));
+    }
     println!(
         "{} cuts of the power, {} of them within a request, of which {} left it whole and the others nothing of it; {} steps, \
          of which the disk made {} fail; {} acknowledged trajectories looked for, none missing",

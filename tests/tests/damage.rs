@@ -115,7 +115,7 @@ fn whatever_page_is_damaged_the_rest_is_taken_over_and_nothing_wrong_passes() {
                     }
                 }
                 Err(StoreError::Corrupt { .. } | StoreError::Database { .. } | StoreError::Foreign { .. }) => {
-                    beyond += 1
+                    beyond += 1;
                 }
                 Err(error) => panic!("trial {trial}: {error}"),
             }

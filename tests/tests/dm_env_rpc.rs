@@ -18,7 +18,7 @@ use tokio::time::{sleep, timeout};
 use tonic_types::{Status, StatusExt as _};
 
 /// Far longer than anything takes.
-const PATIENCE: Duration = Duration::from_secs(60);
+const PATIENCE: Duration = Duration::from_mins(1);
 
 #[test]
 fn deepminds_client_adaptor_and_compliance_tests_pass() {
@@ -337,7 +337,7 @@ async fn hostile_requests_are_answered_and_the_stream_goes_on() {
         (maze("options.slip", doubles(vec![], &[1 << 30, 0])), Code::InvalidArgument, "settings.options.slip"),
         (maze("options.slip", doubles(vec![], &[-1, 0])), Code::InvalidArgument, "settings.options.slip"),
         (maze("options.slip", doubles(vec![0.1; 4], &[-1, -1])), Code::InvalidArgument, "settings.options.slip"),
-        (maze("options.slip", doubles(vec![0.1], &[1; 100_000])), Code::InvalidArgument, "settings.options.slip"),
+        (maze("options.slip", doubles(vec![0.1], &vec![1; 100_000])), Code::InvalidArgument, "settings.options.slip"),
         (
             maze("options.rewards", doubles(vec![1.0; 57 * 4], &[57, 4])),
             Code::InvalidArgument,
@@ -394,7 +394,7 @@ async fn hostile_requests_are_answered_and_the_stream_goes_on() {
         act(vec![0], &[-1]),
         act(vec![0], &[i32::MAX]),
         act(vec![0], &[i32::MAX, i32::MAX, i32::MAX]),
-        act(vec![0; 4], &[1; 100_000]),
+        act(vec![0; 4], &vec![1; 100_000]),
         act(vec![0, 0, 0, 12], &[4]),
         act(vec![0, 0, -1, 0], &[4]),
         act(vec![i32::MIN], &[4]),

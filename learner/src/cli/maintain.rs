@@ -143,7 +143,7 @@ fn text(found: &Verification) -> String {
     }
     let row = |what: &str, tally: Tally| [what.to_owned(), tally.sound.to_string(), tally.damaged.to_string()];
     let rows = [row("trajectories", found.trajectories), row("models", found.models), row("fits", found.fits)];
-    text.extend(["\n", &table(["what", "#sound", "#damaged"], rows).to_string(), "\n\n"]);
+    text.extend(["\n", table(["what", "#sound", "#damaged"], rows).as_str(), "\n\n"]);
     if !found.damage.is_empty() {
         let rows = found.damage.iter().take(NAMED).map(|damage| {
             let kind = match damage.kind {
@@ -153,7 +153,7 @@ fn text(found: &Verification) -> String {
             };
             [kind.to_owned(), damage.name.clone(), damage.message.clone()]
         });
-        text.extend([&table(["damaged", "which", "why"], rows).to_string(), "\n"]);
+        text.extend([table(["damaged", "which", "why"], rows).as_str(), "\n"]);
         if found.damage.len() > NAMED {
             text.extend(["and ", &(found.damage.len() - NAMED).to_string(), " more; --json names them\n"]);
         }

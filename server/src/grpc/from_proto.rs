@@ -88,6 +88,10 @@ pub fn create_session(request: pb::CreateSessionRequest) -> Result<NewSession, C
             return Err(CallError::malformed("autoreset_mode", message));
         }
     };
+    // Before it is converted, which overflows where it is negative beyond all bounds.
+    if request.lease.as_ref().is_some_and(|lease| lease.seconds < 0 || lease.nanos < 0) {
+        return Err(CallError::malformed("lease", "expected a positive duration, got a negative one"));
+    }
     let lease = request.lease.map(Duration::try_from).transpose();
     let lease =
         lease.map_err(|error| CallError::malformed("lease", format!("expected a positive duration: {error}")))?;

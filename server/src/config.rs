@@ -1,6 +1,7 @@
 //! Settings of a server: limits and times, each a flag and an environment variable of the binary.
 
-use crate::{listen::ListenAddress, sessions::Limits};
+use crate::sessions::Limits;
+use mazeway_serving::ListenAddress;
 use std::time::Duration;
 
 /// Everything that a server can be told. [`Config::default`] has the defaults of the flags.

@@ -10,8 +10,6 @@ pub mod config;
 mod dm_env;
 #[cfg(feature = "grpc")]
 mod grpc;
-#[cfg(feature = "grpc")]
-pub mod listen;
 pub mod raster;
 pub mod registry;
 pub mod rollout;
@@ -23,4 +21,4 @@ pub use config::Config;
 #[cfg(feature = "grpc")]
 pub use grpc::{CallError, ServeError, serve};
 #[cfg(feature = "grpc")]
-pub use listen::{ListenAddress, Listener};
+pub use mazeway_serving::{ListenAddress, Listener};

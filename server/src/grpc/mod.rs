@@ -1,7 +1,6 @@
 //! The gRPC face: decoding, calling, encoding, and nothing that computes.
 
 mod aside;
-mod connections;
 mod from_proto;
 pub(crate) mod host;
 pub(crate) mod interact;

@@ -1,9 +1,10 @@
 //! A server from a listener to its shutdown.
 
-use super::{connections::Gate, host::Host, interact::Environments, service::EnvironmentGrpc, workers::Worker};
-use crate::{config::Config, dm_env, listen::Listener};
+use super::{host::Host, interact::Environments, service::EnvironmentGrpc, workers::Worker};
+use crate::{config::Config, dm_env};
 use futures_util::{StreamExt as _, stream::FuturesUnordered};
 use mazeway_proto::env::environment_service_server::EnvironmentServiceServer;
+use mazeway_serving::{Listener, connections::Gate};
 use std::{future::Future, io, sync::Arc, time::Duration};
 use tokio_util::sync::CancellationToken;
 use tonic::{service::Routes, transport::Server};

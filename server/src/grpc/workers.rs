@@ -4,11 +4,11 @@
 //! wake-up of another (docs/PERFORMANCE.md has what that saves). What takes long runs on threads for blocking work, so that
 //! a connection does not wait for its neighbours' large batches.
 
-use super::{
+use super::serve::ServeError;
+use mazeway_serving::{
     connections::{Connection, Counted, Load},
-    serve::ServeError,
+    listen::Accepted,
 };
-use crate::listen::Accepted;
 use std::{io, thread, time::Duration};
 use tokio::{
     sync::{OwnedSemaphorePermit, mpsc, oneshot},
@@ -75,7 +75,7 @@ async fn serve(
     grace: Duration,
 ) -> Result<(), ServeError> {
     let incoming = UnboundedReceiverStream::new(arriving).map(|(connection, place, load)| {
-        Ok::<_, io::Error>(Connection { socket: connection.into_socket()?, _place: place, _load: load })
+        Ok::<_, io::Error>(Connection { socket: connection.into_socket()?, place, load })
     });
     let stop = stopping.clone().cancelled_owned();
     let serving = server.add_routes(routes).serve_with_incoming_shutdown(incoming, stop);

@@ -89,7 +89,10 @@ impl Listener {
     }
 
     /// The next connection.
-    pub(crate) async fn accept(&self) -> io::Result<Accepted> {
+    ///
+    /// # Errors
+    /// The operating system gives none: there are too many open files, or the peer has gone again.
+    pub async fn accept(&self) -> io::Result<Accepted> {
         match self {
             Self::Tcp(listener) => {
                 let (stream, _) = listener.accept().await?;
@@ -110,21 +113,26 @@ impl From<TcpListener> for Listener {
 
 /// A connection that belongs to no runtime yet.
 #[derive(Debug)]
-pub(crate) enum Accepted {
+pub enum Accepted {
+    /// Over TCP.
     Tcp(std::net::TcpStream),
+    /// Over a Unix socket.
     #[cfg(unix)]
     Unix(std::os::unix::net::UnixStream),
 }
 
 /// A connection of either kind.
 #[cfg(unix)]
-pub(crate) type Socket = Either<TcpStream, UnixStream>;
+pub type Socket = Either<TcpStream, UnixStream>;
 /// A connection; there is but one kind here.
 #[cfg(not(unix))]
-pub(crate) type Socket = Either<TcpStream, TcpStream>;
+pub type Socket = Either<TcpStream, TcpStream>;
 
 impl Accepted {
     /// Hands the connection to the present runtime.
+    ///
+    /// # Errors
+    /// The runtime cannot watch it.
     pub fn into_socket(self) -> io::Result<Socket> {
         match self {
             Self::Tcp(stream) => TcpStream::from_std(stream).map(Either::Left),

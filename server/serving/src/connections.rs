@@ -1,6 +1,6 @@
 //! A bound on connections, which the transport has not: one above it is closed at once, so that its client learns of it.
 
-use crate::listen::{Accepted, Listener, Socket};
+use super::listen::{Accepted, Listener, Socket};
 use std::{
     io,
     pin::Pin,
@@ -21,6 +21,7 @@ use tonic::transport::server::Connected;
 const PAUSE: Duration = Duration::from_millis(50);
 
 /// Takes connections, `max` at a time.
+#[derive(Debug)]
 pub struct Gate {
     listener: Listener,
     places: Arc<Semaphore>,
@@ -28,6 +29,7 @@ pub struct Gate {
 }
 
 impl Gate {
+    /// Takes at most `max` connections at a time from `listener`.
     pub fn new(listener: Listener, max: usize) -> Self {
         Self { listener, places: Arc::new(Semaphore::new(max.min(Semaphore::MAX_PERMITS))), max }
     }
@@ -58,6 +60,7 @@ impl Load {
         Counted(Arc::clone(&self.0))
     }
 
+    /// How many there are.
     pub fn get(&self) -> usize {
         self.0.load(Ordering::Relaxed)
     }
@@ -76,9 +79,12 @@ impl Drop for Counted {
 /// A connection that counts until it is dropped.
 #[derive(Debug)]
 pub struct Connection {
+    /// Its bytes.
     pub socket: Socket,
-    pub _place: OwnedSemaphorePermit,
-    pub _load: Counted,
+    /// Its place among all that are admitted.
+    pub place: OwnedSemaphorePermit,
+    /// Its part of a worker's load.
+    pub load: Counted,
 }
 
 impl Connected for Connection {

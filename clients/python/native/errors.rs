@@ -57,9 +57,11 @@ impl From<Status> for Failure {
             return Self { code: Code::Unavailable, message: cause.to_string(), violations: Vec::new() };
         }
         let details = status.get_error_details();
-        let violations = details.bad_request().into_iter().flat_map(|bad| &bad.field_violations);
+        let fields = details.bad_request().into_iter().flat_map(|bad| &bad.field_violations);
+        let fields = fields.map(|v| (v.field.clone(), v.description.clone()));
+        let subjects = details.precondition_failure().into_iter().flat_map(|failure| &failure.violations);
         Self {
-            violations: violations.map(|v| (v.field.clone(), v.description.clone())).collect(),
+            violations: fields.chain(subjects.map(|v| (v.subject.clone(), v.description.clone()))).collect(),
             code: status.code(),
             message: status.message().to_owned(),
         }

@@ -19,9 +19,9 @@ use pyo3::{
 use std::{sync::Arc, time::Duration};
 use tokio::sync::Mutex;
 
-/// How long a stream that ended while nobody looked is tried to be opened anew: the next one says what was wrong. To make a
-/// lost session anew is for Python.
-const RESUME: Duration = Duration::from_secs(1);
+/// How long a stream that ended while nobody looked is tried to be opened anew, unless the answer would be late before: the
+/// next one says what was wrong. To make a lost session anew is for Python.
+const RESUME: Duration = Duration::from_secs(10);
 
 /// Observations, info columns.
 type First = (Py<PyAny>, Py<PyList>);
@@ -93,7 +93,8 @@ impl Inner {
             env
         } else {
             let connection = self.link.dial.connection().await?;
-            slot.insert(VectorEnv::attach(&connection, self.created.clone(), Some(RESUME))?)
+            let resume_within = self.timeout.mul_f64(0.8).min(RESUME);
+            slot.insert(VectorEnv::attach(&connection, self.created.clone(), Some(resume_within))?)
         };
         Ok(match ask {
             Ask::Reset(seeds, None) => Said::First(env.reset(seeds).await?),

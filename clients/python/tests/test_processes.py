@@ -1,5 +1,6 @@
 """Forks, pickles, threads, and servers that stop, hang, return and forget."""
 
+import contextlib
 import copy
 import multiprocessing
 import pickle
@@ -14,6 +15,7 @@ import pytest
 from conftest import start_server
 
 import mazeway
+from mazeway import _transport, _wire
 
 # A fork beside running threads is what these tests are about; Python 3.12 and later warn of it.
 pytestmark = pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
@@ -282,3 +284,42 @@ def test_an_interrupted_step_asks_for_a_reset(own_server):
     assert repr(env.step(2)) == repr(reference.step(2))
     env.close()
     reference.close()
+
+
+def test_a_stream_that_the_server_still_holds_is_waited_for(server):
+    reference = mazeway.MazewayEnv("Maze-v0", server)
+    env = mazeway.MazewayEnv("Maze-v0", server, timeout=5)
+    env._session.open()
+    with held(env) as holder:
+        timer = threading.Timer(0.3, holder.cancel)
+        timer.start()
+        assert repr(env.reset(seed=1)) == repr(reference.reset(seed=1))
+        timer.join()
+    assert repr(env.step(2)) == repr(reference.step(2))
+    env.close()
+    reference.close()
+
+
+def test_a_session_that_stays_in_use_is_an_error(server):
+    env = mazeway.MazewayEnv("Maze-v0", server, timeout=1)
+    env._session.open()
+    with held(env), pytest.raises(mazeway.SessionInUseError, match="in use by another"):
+        env.reset(seed=1)
+    env.reset(seed=1)
+    env.close()
+
+
+@contextlib.contextmanager
+def held(env):
+    """Another stream that has the session of `env`."""
+    transport = _transport.connect(env.address, _wire.ENVIRONMENT_SERVICE)
+    stream = transport.exchange("Interact", timeout=10)
+    request = _wire.env.InteractRequest()
+    request.reset.session_id = env._session._connection.session_id
+    stream.send(request)
+    stream.receive()
+    try:
+        yield stream
+    finally:
+        stream.cancel()
+        transport.close()

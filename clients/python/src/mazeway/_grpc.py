@@ -173,17 +173,22 @@ def _is_local_deadline(error: grpc.RpcError) -> bool:
 
 
 def _violations(error: grpc.RpcError) -> list[tuple[str, str]]:
-    """Field and description of each google.rpc.BadRequest violation in the trailers."""
+    """Field and description of each violation that the trailers name."""
     metadata: Any = error.trailing_metadata() or ()
-    for key, value in metadata:
-        if key == "grpc-status-details-bin":
-            return [
-                (violation.field, violation.description)
-                for detail in _wire.status.Status.FromString(value).details
-                if detail.type_url.endswith("/google.rpc.BadRequest")
-                for violation in _wire.status.BadRequest.FromString(detail.value).field_violations
-            ]
-    return []
+    violations: list[tuple[str, str]] = []
+    for detail in (
+        detail
+        for key, value in metadata
+        if key == "grpc-status-details-bin"
+        for detail in _wire.status.Status.FromString(value).details
+    ):
+        if detail.type_url.endswith("/google.rpc.BadRequest"):
+            fields = _wire.status.BadRequest.FromString(detail.value).field_violations
+            violations += [(violation.field, violation.description) for violation in fields]
+        elif detail.type_url.endswith("/google.rpc.PreconditionFailure"):
+            subjects = _wire.status.PreconditionFailure.FromString(detail.value).violations
+            violations += [(violation.subject, violation.description) for violation in subjects]
+    return violations
 
 
 class _GrpcExchange:

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import contextlib
 import operator
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, Protocol
 
 import gymnasium
@@ -18,10 +19,14 @@ import numpy.typing as npt
 
 from mazeway import _arrays, _wire
 from mazeway._transport import Exchange, Transport
-from mazeway.errors import MazewayError
+from mazeway.errors import MazewayError, SessionInUseError
 
 if TYPE_CHECKING:
     from mazeway._native_transport import NativeTransport
+
+#: Longest wait for the server to notice that a stream of ours is gone, and pauses between attempts meanwhile.
+_SETTLE_SECS = 10.0
+_PAUSES_SECS = (0.005, 0.25)
 
 #: Which environments are meant, shape (num_envs,).
 Mask = npt.NDArray[np.bool_]
@@ -140,6 +145,8 @@ class MessageLink:
         self._session_id = created.session_id
         self._timeout = timeout
         self._exchange: Exchange | None = None
+        #: What was sent on a stream that has not answered yet; None from its first answer on.
+        self._opening: list[Any] | None = None
         self._n_actions = spec.n_actions
         self._dtype = _arrays.space_dtype(spec.observation_space)
         space = _arrays.space_from_wire(spec.observation_space)
@@ -232,7 +239,7 @@ class MessageLink:
             self._exchange.receive()
         else:
             request = _wire.env.CloseSessionRequest(session_id=self._session_id)
-            self._transport.unary("CloseSession", request, timeout=timeout)
+            self._insist(lambda: self._transport.unary("CloseSession", request, timeout=timeout), timeout)
 
     def _ask(self, request: Any) -> Any:
         self._send(request)
@@ -242,12 +249,41 @@ class MessageLink:
         if self._exchange is None or not self._exchange.alive:
             self._exchange = self._transport.exchange("Interact", timeout=self._timeout)
             getattr(request, request.WhichOneof("request")).session_id = self._session_id
+            self._opening = []
+        if self._opening is not None:
+            self._opening.append(request)
         self._exchange.send(request)
 
     def _receive(self) -> Any:
         if self._exchange is None:
             raise MazewayError("expected an answer that was asked for")
+        opening, self._opening = self._opening, None
+        try:
+            return self._exchange.receive()
+        except SessionInUseError:
+            if opening is None:
+                raise
+        # The server has not noticed yet that our last stream is gone; it carried out nothing of this one.
+        return self._insist(lambda: self._ask_anew(opening), self._timeout)
+
+    def _ask_anew(self, requests: list[Any]) -> Any:
+        self._exchange = self._transport.exchange("Interact", timeout=self._timeout)
+        for request in requests:
+            self._exchange.send(request)
         return self._exchange.receive()
+
+    def _insist(self, call: Callable[[], Any], timeout: float) -> Any:
+        """Calls until the session is free, within bounds."""
+        deadline = time.monotonic() + min(0.8 * timeout, _SETTLE_SECS)
+        pause, longest = _PAUSES_SECS
+        while True:
+            try:
+                return call()
+            except SessionInUseError:
+                if time.monotonic() + pause > deadline:
+                    raise
+            time.sleep(pause)
+            pause = min(2 * pause, longest)
 
     def _first(self, response: Any) -> First:
         return self._observations(response.observations), self._batch(response.infos)

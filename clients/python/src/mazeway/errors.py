@@ -70,6 +70,10 @@ class WrongStateError(MazewayError, RuntimeError):
     """The call makes no sense now, such as a step after the episode's end."""
 
 
+class SessionInUseError(WrongStateError):
+    """Another call or stream has the session at this moment."""
+
+
 class ResetNeededError(WrongStateError, gymnasium.error.ResetNeeded):
     """`reset` must come first."""
 
@@ -157,6 +161,8 @@ def from_status(
             hint=f"check that the address is right and the server current: {start}",
         )
     kind = _KINDS.get(name)
+    if kind is WrongStateError and violations and violations[0][0] == "session_id":
+        kind = SessionInUseError
     if kind is None:
         return ServerFailureError(f"the server at {address} failed: {name}: {details}")
     if kind is InvalidArgumentError:

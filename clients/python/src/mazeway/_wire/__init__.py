@@ -32,7 +32,7 @@ class Method:
 
 
 def _status_file() -> descriptor_pb2.FileDescriptorProto:
-    """Describes, wire-compatibly, the parts of google.rpc.Status and BadRequest that errors carry."""
+    """Describes, wire-compatibly, the parts of google.rpc.Status and its details that errors carry."""
     field = descriptor_pb2.FieldDescriptorProto
     one, many = field.LABEL_OPTIONAL, field.LABEL_REPEATED
     file = descriptor_pb2.FileDescriptorProto(
@@ -52,6 +52,14 @@ def _status_file() -> descriptor_pb2.FileDescriptorProto:
         "FieldViolation": [
             ("field", 1, field.TYPE_STRING, one, ""),
             ("description", 2, field.TYPE_STRING, one, ""),
+        ],
+        "PreconditionFailure": [
+            ("violations", 1, field.TYPE_MESSAGE, many, ".mazeway.python.PreconditionViolation")
+        ],
+        "PreconditionViolation": [
+            ("type", 1, field.TYPE_STRING, one, ""),
+            ("subject", 2, field.TYPE_STRING, one, ""),
+            ("description", 3, field.TYPE_STRING, one, ""),
         ],
     }
     for name, fields in layout.items():

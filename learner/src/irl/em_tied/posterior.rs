@@ -9,7 +9,7 @@ use crate::irl::random::Stream;
 use crate::irl::{
     Basis, Fit, FitError, Hyperparameter, Penalty, Posterior, PosteriorKind, Problem, Trace, diagnostics,
 };
-use crate::mdp::{Policy, plan};
+use crate::mdp::{Policy, TabularMdp, plan};
 use rayon::prelude::*;
 
 /// Most basis functions that are sampled.
@@ -25,8 +25,8 @@ const WARMEST: f64 = 0.02;
 const MAX_NUMBERS: u64 = 100_000_000;
 /// Chains with a larger split-R̂ do not agree.
 const LARGEST_RHAT: f64 = 1.1;
-/// What acting as the expert would is worth beside the value, in full rewards: actions that are worth nearly the same under the
-/// mean reward are told apart by how often the draws take them.
+/// What the most probable action of the expert is worth beside the value, in full rewards: actions that are worth nearly the same
+/// under the mean reward are told apart by how many draws put them first.
 const AGREEMENT: f64 = 1.0;
 /// Draws between two looks at whether the fit is still wanted.
 const BLOCK: u32 = 20;
@@ -109,7 +109,7 @@ fn sample(
             let from = start.iter().map(|&w| if w > least { prior.scale } else { 0.0 }).collect();
             let setting = (basis, &neighbours, places);
             let chain = Chain::new(setting, process.clone(), from, (prior, fixed), stream);
-            Sampled::new(chain, mdp.n_pairs())
+            Sampled::new(chain, mdp)
         })
         .collect();
     let total = warm_up.saturating_add(draws);
@@ -146,10 +146,11 @@ fn sample(
     if !planned.converged {
         fit.warnings.push("the planner stopped before it converged".to_owned());
     }
-    // the value of acting on the mean reward, and what it is worth to act as the expert most probably would
+    // the value of acting on the mean reward, and what it is worth to act as most draws would
     let full = fit.reward.iter().fold(0.0, |largest: f64, r| largest.max(r.abs()));
+    let of_draws = |pair: usize| average(&|c| c.greedy_policy[pair]);
     let worth: Vec<f64> =
-        planned.action_values.iter().zip(&fit.policy).map(|(q, p)| q + AGREEMENT * full * p).collect();
+        planned.action_values.iter().enumerate().map(|(pair, q)| q + AGREEMENT * full * of_draws(pair)).collect();
     fit.greedy_policy = Policy::greedy(mdp.n_actions(), &worth).into_probabilities();
     fit.state_values = planned.state_values;
     fit.weights = mean;
@@ -166,26 +167,35 @@ fn coldness(draw: u32, warm_up: u32) -> f64 {
 /// A chain and what is kept of it.
 struct Sampled<'a> {
     chain: Chain<'a>,
+    n_actions: usize,
     /// Weights of all kept draws, one after the other.
     weights: Vec<f64>,
     /// Sum of the policies of the kept draws.
     policy: Vec<f64>,
+    /// Sum of their greedy policies.
+    greedy_policy: Vec<f64>,
     /// Sums of the prior's parameters over the kept draws.
     prior: Prior,
 }
 
 impl<'a> Sampled<'a> {
-    fn new(chain: Chain<'a>, n_pairs: usize) -> Self {
+    fn new(chain: Chain<'a>, mdp: &TabularMdp) -> Self {
         let prior = Prior { inclusion: 0.0, full: 0.0, scale: 0.0, shape: 0.0 };
-        Self { chain, weights: Vec::new(), policy: vec![0.0; n_pairs], prior }
+        let zeros = vec![0.0; mdp.n_pairs()];
+        let n_actions = mdp.n_actions();
+        Self { chain, n_actions, weights: Vec::new(), policy: zeros.clone(), greedy_policy: zeros, prior }
     }
 
     fn draw(&mut self, keep: bool) {
         self.chain.advance(PROPOSALS);
         if keep {
             self.weights.extend_from_slice(self.chain.weights());
-            for (sum, p) in self.policy.iter_mut().zip(self.chain.policy()) {
+            let policy = self.chain.policy();
+            let greedy_policy = Policy::greedy(self.n_actions, policy);
+            let sums = self.policy.iter_mut().zip(&mut self.greedy_policy);
+            for ((sum, greedy), (p, g)) in sums.zip(policy.iter().zip(greedy_policy.probabilities())) {
                 *sum += p;
+                *greedy += g;
             }
             let prior = self.chain.prior();
             self.prior.inclusion += prior.inclusion;

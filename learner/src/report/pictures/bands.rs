@@ -23,7 +23,7 @@ const FLOOR: f64 = 1e-3;
 
 /// Told apart by lightness as well as by hue, after Paul Tol's and Okabe and Ito's colour-blind safe sets; the first is the
 /// baseline's.
-const HUES: [RGBColor; 12] = [
+const HUES: [RGBColor; 16] = [
     RGBColor(0x00, 0x65, 0xa8),
     RGBColor(0xd5, 0x5e, 0x00),
     RGBColor(0x00, 0x9e, 0x73),
@@ -36,6 +36,10 @@ const HUES: [RGBColor; 12] = [
     RGBColor(0x33, 0x22, 0x88),
     RGBColor(0xcc, 0x66, 0x77),
     RGBColor(0x77, 0x77, 0x77),
+    RGBColor(0x7a, 0x4b, 0x2a),
+    RGBColor(0x00, 0x80, 0x80),
+    RGBColor(0xb5, 0x7e, 0xdc),
+    RGBColor(0x14, 0x5a, 0x14),
 ];
 
 /// One picture a measure; `what` says what was compared.

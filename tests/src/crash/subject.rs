@@ -5,7 +5,7 @@ use super::{
     history::{Contents, Selection, Spec, Step, fit, model},
     vfs::with_disk,
 };
-use mazeway_learner::store::{Filter, Put, Store, StoreError};
+use mazeway_learner::store::{Filter, Put, Recording, Store, StoreError};
 use proptest::{prelude::*, test_runner::TestCaseError};
 use std::rc::Rc;
 
@@ -32,8 +32,8 @@ pub(super) struct Subject<'a> {
 enum Outcome {
     /// As it should: the store holds this, and held one of those meanwhile.
     Done { after: Rc<Contents>, during: Vec<Rc<Contents>> },
-    /// The disk failed: the store holds one of these.
-    Failed(Vec<Rc<Contents>>),
+    /// The disk failed: the store holds one of `after`, and held one of those or of `during` meanwhile.
+    Failed { after: Vec<Rc<Contents>>, during: Vec<Rc<Contents>> },
 }
 
 impl<'a> Subject<'a> {
@@ -179,12 +179,27 @@ impl<'a> Subject<'a> {
             }
             return Ok(Outcome::Done { after: Rc::new(contents), during });
         }
-        // Every set of requests that has those which were acknowledged.
+        // They are taken up in their order, each commit with one or more: once the first k have been, every set of these that
+        // has those which were acknowledged.
+        let after = self.possible(&requests, &answers)?;
+        let mut during = Vec::new();
+        for k in 1..requests.len() {
+            during.extend(self.possible(&requests[..k], &answers[..k])?);
+        }
+        Ok(Outcome::Failed { after, during })
+    }
+
+    /// What the store may hold after requests of which some have failed with the disk.
+    fn possible(
+        &self,
+        requests: &[Vec<Recording>],
+        answers: &[Result<u32, StoreError>],
+    ) -> Result<Vec<Rc<Contents>>, TestCaseError> {
         let mut possible = Vec::new();
         for set in 0_u32..1 << requests.len() {
             let mut contents = Contents::clone(&self.visible);
             let mut consistent = true;
-            for (i, (request, answer)) in requests.iter().zip(&answers).enumerate() {
+            for (i, (request, answer)) in requests.iter().zip(answers).enumerate() {
                 let chosen = set >> i & 1 == 1;
                 match answer {
                     Ok(_) => consistent &= chosen && contents.record(request),
@@ -197,7 +212,7 @@ impl<'a> Subject<'a> {
                 possible.push(Rc::new(contents));
             }
         }
-        Ok(Outcome::Failed(possible))
+        Ok(possible)
     }
 
     /// Of a step that is done as a whole or not at all.
@@ -216,7 +231,7 @@ impl<'a> Subject<'a> {
             }
             Err(error) => {
                 check_disk(&error)?;
-                Ok(Outcome::Failed(vec![Rc::clone(&self.visible), after]))
+                Ok(Outcome::Failed { after: vec![Rc::clone(&self.visible), after], during: Vec::new() })
             }
         }
     }
@@ -235,14 +250,15 @@ impl<'a> Subject<'a> {
                 }
                 self.visible = after;
             }
-            Outcome::Failed(possible) => {
+            Outcome::Failed { after, during } => {
                 self.tally.failed_steps += 1;
-                for contents in &possible {
+                for contents in &after {
                     add(&mut allowed, Rc::clone(contents));
                 }
-                self.within(from, to, allowed.clone());
-                self.allowed = allowed;
-                self.visible = self.look(&possible)?;
+                self.allowed = allowed.clone();
+                during.into_iter().for_each(|contents| add(&mut allowed, contents));
+                self.within(from, to, allowed);
+                self.visible = self.look(&after)?;
             }
         }
         self.segments.push(Segment { from: to, allowed: self.allowed.clone() });

@@ -31,6 +31,12 @@ pub struct Config {
     /// Steps of one roll-out in all, burn-in included.
     #[arg(long, env = "MAZEWAY_MAX_ROLLOUT_STEPS", default_value_t = 1_000_000_000, value_name = "N")]
     pub max_rollout_steps: u64,
+    /// Viewers of one session at a time; a further one is refused with `RESOURCE_EXHAUSTED`.
+    #[arg(long, env = "MAZEWAY_MAX_VIEWERS_PER_SESSION", default_value_t = 64, value_name = "N")]
+    pub max_viewers_per_session: usize,
+    /// Viewers of all sessions together.
+    #[arg(long, env = "MAZEWAY_MAX_VIEWERS", default_value_t = 256, value_name = "N")]
+    pub max_viewers: usize,
     /// Models that are computed at a time; further callers wait.
     #[arg(long, env = "MAZEWAY_MAX_CONCURRENT_MODELS", default_value_t = 2, value_name = "N")]
     pub max_concurrent_models: usize,
@@ -62,6 +68,8 @@ impl Default for Config {
             max_message_bytes: 16 << 20,
             max_concurrent_rollouts: 8,
             max_rollout_steps: 1_000_000_000,
+            max_viewers_per_session: 64,
+            max_viewers: 256,
             max_concurrent_models: 2,
             max_connections: 1024,
             max_streams_per_connection: 2048,

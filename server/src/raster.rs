@@ -63,19 +63,32 @@ pub enum RasterError {
     Png(String),
 }
 
-/// Rasterises an SVG document on white.
+/// Rasterises an SVG document on white, at its own size.
 ///
 /// # Errors
 /// It is no SVG, or too large.
 pub fn rasterise(svg: &str, format: Format) -> Result<Picture, RasterError> {
+    rasterise_within(svg, format, u32::MAX)
+}
+
+/// As [`rasterise`], drawn smaller where it is more than `max_width` pixels across.
+///
+/// # Errors
+/// It is no SVG, or too large.
+pub fn rasterise_within(svg: &str, format: Format, max_width: u32) -> Result<Picture, RasterError> {
     let options = Options { fontdb: Arc::clone(&FONTS), font_family: "Ubuntu".into(), ..Options::default() };
     let tree = Tree::from_str(svg, &options).map_err(|error| RasterError::Svg(error.to_string()))?;
     let size = tree.size().to_int_size();
-    let (width, height) = (size.width(), size.height());
+    let (mut width, mut height, mut scale) = (size.width(), size.height(), Transform::default());
+    if width > max_width.max(1) {
+        let factor = max_width.max(1) as f32 / width as f32;
+        (width, height) = (max_width.max(1), ((height as f32 * factor).round() as u32).max(1));
+        scale = Transform::from_scale(factor, factor);
+    }
     let pixels = if width.max(height) <= MAX_PIXELS { Pixmap::new(width, height) } else { None };
     let mut pixels = pixels.ok_or(RasterError::Size { width, height })?;
     pixels.fill(Color::WHITE);
-    resvg::render(&tree, Transform::default(), &mut pixels.as_mut());
+    resvg::render(&tree, scale, &mut pixels.as_mut());
     let content = match format {
         Format::Rgb => pixels.data().as_chunks::<4>().0.iter().flat_map(|[r, g, b, _]| [*r, *g, *b]).collect(),
         Format::Png => pixels.encode_png().map_err(|error| RasterError::Png(error.to_string()))?,
@@ -94,6 +107,17 @@ mod tests {
         let picture = rasterise(SQUARE, Format::Rgb).expect("an SVG");
         let row = [255, 0, 0, 255, 255, 255, 255, 255, 255];
         assert_eq!(picture, Picture { content: [row, row].concat(), width: 3, height: 2 });
+    }
+
+    #[test]
+    fn what_is_too_wide_is_drawn_smaller() {
+        let square = SQUARE
+            .replace("width='3' height='2'", "width='300' height='200'")
+            .replace("width='1' height='2'", "width='100' height='200'");
+        let picture = rasterise_within(&square, Format::Rgb, 3).expect("an SVG");
+        assert_eq!(picture, rasterise(SQUARE, Format::Rgb).expect("an SVG"));
+        assert_eq!(rasterise_within(SQUARE, Format::Rgb, 3), rasterise(SQUARE, Format::Rgb));
+        assert_eq!(rasterise_within(SQUARE, Format::Rgb, 1).map(|p| (p.width, p.height)), Ok((1, 1)));
     }
 
     #[test]

@@ -5,12 +5,18 @@
 //! by its lease and no longer. Deliberately absent: transports, clocks (callers pass the time) and timers (someone calls
 //! [`Sessions::reap`]).
 
+mod sight;
+
+pub use sight::{Glance, Viewer, Wish};
+
 use crate::batch::Batch;
+use sight::Sight;
 use std::{
     collections::{HashMap, VecDeque},
     fmt,
     ops::{Deref, DerefMut},
     sync::{Arc, Mutex, MutexGuard, PoisonError},
+    task::Waker,
     time::{Duration, Instant},
 };
 
@@ -106,6 +112,9 @@ struct Slot {
     batch: Option<Box<dyn Batch>>,
     /// What reaches the owner of a batch that is taken, if it listens.
     owner: Option<OwnerHandle>,
+    sight: Arc<Sight>,
+    /// Pictures a second at which it looks natural.
+    render_fps: u32,
     num_envs: usize,
     lease: Duration,
     expires: Instant,
@@ -125,6 +134,7 @@ impl Inner {
     fn remove(&mut self, id: SessionId) {
         if let Some(slot) = self.slots.remove(&id) {
             self.total_envs -= slot.num_envs;
+            slot.sight.end();
         }
     }
 
@@ -223,13 +233,15 @@ impl Sessions {
                 inner.total_envs.saturating_add(num_envs),
             )?;
             inner.total_envs += num_envs;
-            inner.slots.insert(id, Slot { batch: None, owner: None, num_envs, lease, expires: now + lease });
+            let (sight, expires) = (Arc::default(), now + lease);
+            inner.slots.insert(id, Slot { batch: None, owner: None, sight, render_fps: 1, num_envs, lease, expires });
         }
         // The slot is reserved: the batch, which may be large, is made without the lock. Should that panic, the slot goes.
         let reserved = Reserved { sessions: self, id };
         let batch = make();
         std::mem::forget(reserved);
         if let Some(slot) = self.lock().slots.get_mut(&id) {
+            slot.render_fps = batch.spec().render_fps;
             slot.batch = Some(batch);
         }
         Ok((id, lease))
@@ -250,7 +262,31 @@ impl Sessions {
         let slot = inner.slot(id, now)?;
         let batch = slot.batch.take().ok_or(SessionError::Busy)?;
         slot.owner = owner;
-        Ok(Guard { sessions: Arc::clone(self), id, lease: slot.lease, batch: Some(batch) })
+        let (lease, sight) = (slot.lease, Arc::clone(&slot.sight));
+        Ok(Guard { sessions: Arc::clone(self), id, lease, sight, batch: Some(batch) })
+    }
+
+    /// Leaves a wish to see a session, granted at once where nobody has taken it, else by its taker. Looking is no use of it:
+    /// its lease runs on.
+    ///
+    /// # Errors
+    /// Unknown or expired.
+    pub fn look(&self, id: SessionId, now: Instant, wish: Wish) -> Result<(), SessionError> {
+        let mut inner = self.lock();
+        let slot = inner.slot(id, now)?;
+        slot.sight.wish(wish);
+        if let Some(batch) = &slot.batch {
+            slot.sight.show(&**batch);
+        }
+        Ok(())
+    }
+
+    /// Pictures a second at which a session looks natural.
+    ///
+    /// # Errors
+    /// Unknown or expired.
+    pub fn render_fps(&self, id: SessionId, now: Instant) -> Result<u32, SessionError> {
+        Ok(self.lock().slot(id, now)?.render_fps)
     }
 
     /// What the present taker of a session left to be reached by; `None` where nobody has taken it or left nothing.
@@ -299,6 +335,7 @@ pub struct Guard {
     sessions: Arc<Sessions>,
     id: SessionId,
     lease: Duration,
+    sight: Arc<Sight>,
     batch: Option<Box<dyn Batch>>,
 }
 
@@ -317,6 +354,17 @@ impl Guard {
     /// How long the session outlives its last use.
     pub fn lease(&self) -> Duration {
         self.lease
+    }
+
+    /// Lets viewers see the session as it is now. Whoever keeps a session calls this after every change and when woken by what
+    /// [`Self::set_waker`] was given; who takes it for a single call need not.
+    pub fn show(&self) {
+        self.sight.show(&**self);
+    }
+
+    /// Has the owner woken where viewers wish to see the session.
+    pub fn set_waker(&self, waker: Waker) {
+        self.sight.set_owner(Some(waker));
     }
 
     /// Ends the session.
@@ -354,6 +402,8 @@ impl Drop for Guard {
             if std::thread::panicking() {
                 inner.remove(self.id);
             } else if let Some(slot) = inner.slots.get_mut(&self.id) {
+                slot.sight.set_owner(None);
+                slot.sight.show(&*batch);
                 slot.batch = Some(batch);
                 slot.owner = None;
                 slot.expires = Instant::now() + slot.lease;

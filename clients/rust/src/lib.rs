@@ -32,6 +32,7 @@ mod session;
 pub mod spec;
 mod stream;
 mod vector;
+mod watch;
 
 pub use connection::{Connection, channel, list_environments, model, rollout};
 pub use env::{Env, Step};
@@ -45,3 +46,4 @@ pub use session::{Autoreset, Image, SessionOptions};
 pub use spec::{EnvSpec, Options};
 pub use tonic::Code;
 pub use vector::{ResetBatch, Seeds, StepBatch, VectorEnv};
+pub use watch::{Frame, Frames, PictureMode, WatchOptions};

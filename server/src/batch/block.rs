@@ -25,6 +25,11 @@ impl Clock {
         self.0 & ENDED != 0
     }
 
+    /// Steps of the episode.
+    pub fn steps(self) -> u32 {
+        self.0 & !ENDED
+    }
+
     /// One step more, up to the most that can be told.
     fn tick(&mut self) -> u32 {
         self.0 = (self.0 + 1).min(ENDED - 1);

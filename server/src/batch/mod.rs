@@ -53,6 +53,37 @@ pub enum Seeds<'a> {
     Each(&'a [u8]),
 }
 
+/// How far a session has come.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Moment {
+    /// Steps of the batch.
+    pub steps: u64,
+    /// Steps and resets of the batch: as long as it is the same, so is what there is to see.
+    pub changes: u64,
+    /// Steps of the environment's episode.
+    pub episode_steps: u32,
+    /// That episode is over, and no other has begun.
+    pub ended: bool,
+}
+
+/// An environment as it was at some moment, to be drawn whenever and wherever that suits.
+pub trait Picture: Send {
+    /// As text.
+    fn text(&self) -> String;
+    /// As an SVG document.
+    fn svg(&self) -> String;
+}
+
+impl<S: Simulator> Picture for S {
+    fn text(&self) -> String {
+        self.render_text()
+    }
+
+    fn svg(&self) -> String {
+        self.render_svg()
+    }
+}
+
 /// A batch of environments behind one face, whatever their kind.
 pub trait Batch: Any + Send {
     /// The environment as configured.
@@ -78,6 +109,16 @@ pub trait Batch: Any + Send {
     /// # Errors
     /// No such environment, no reset yet.
     fn tabular_state(&self, index: usize) -> Result<u32, BatchError>;
+    /// How far it and its environment `index` have come.
+    ///
+    /// # Errors
+    /// No such environment, no reset yet.
+    fn moment(&self, index: usize) -> Result<Moment, BatchError>;
+    /// A copy of environment `index` as it stands.
+    ///
+    /// # Errors
+    /// No such environment, no reset yet.
+    fn picture(&self, index: usize) -> Result<Box<dyn Picture>, BatchError>;
     /// Draws environment `index` as text.
     ///
     /// # Errors
@@ -106,6 +147,8 @@ pub struct SimBatch<S: Simulator> {
     buffers: StepBuffers,
     /// Set by the first reset, which covers every environment.
     born: bool,
+    steps: u64,
+    resets: u64,
 }
 
 impl<S: Simulator> SimBatch<S> {
@@ -126,16 +169,24 @@ impl<S: Simulator> SimBatch<S> {
             clocks: vec![Clock::default(); options.num_envs],
             buffers: StepBuffers::new(layout),
             born: false,
+            steps: 0,
+            resets: 0,
         }
+    }
+
+    /// Refuses an environment that there is not, or not yet.
+    fn check_index(&self, index: usize) -> Result<(), BatchError> {
+        let num_envs = self.options.num_envs;
+        if index >= num_envs {
+            return Err(BatchError::IndexOutOfRange { index, num_envs });
+        }
+        if self.born { Ok(()) } else { Err(BatchError::NeverReset) }
     }
 
     /// Environment `index` as it stands.
     fn environment(&self, index: usize) -> Result<S, BatchError> {
-        let num_envs = self.options.num_envs;
-        let mut stored = self.states.get(index).ok_or(BatchError::IndexOutOfRange { index, num_envs })?.clone();
-        if !self.born {
-            return Err(BatchError::NeverReset);
-        }
+        self.check_index(index)?;
+        let mut stored = self.states[index].clone();
         Ok(S::load(&mut self.scratch.clone(), &mut stored).clone())
     }
 
@@ -246,17 +297,29 @@ impl<S: Simulator> Batch for SimBatch<S> {
         let fresh = fresh.map_err(|error| BatchError::Entropy(error.to_string()))?;
         self.run(Work::Reset { seeds, mask, fresh });
         self.born = true;
+        self.resets += 1;
         Ok(&self.buffers)
     }
 
     fn step(&mut self, actions: &[u8]) -> Result<&StepBuffers, BatchError> {
         let actions = self.check_actions(actions)?;
         self.run(Work::Step { actions });
+        self.steps += 1;
         Ok(&self.buffers)
     }
 
     fn tabular_state(&self, index: usize) -> Result<u32, BatchError> {
         Ok(self.environment(index)?.tabular_state())
+    }
+
+    fn moment(&self, index: usize) -> Result<Moment, BatchError> {
+        self.check_index(index)?;
+        let (clock, changes) = (self.clocks[index], self.steps + self.resets);
+        Ok(Moment { steps: self.steps, changes, episode_steps: clock.steps(), ended: clock.ended() })
+    }
+
+    fn picture(&self, index: usize) -> Result<Box<dyn Picture>, BatchError> {
+        Ok(Box::new(self.environment(index)?))
     }
 
     fn render_text(&self, index: usize) -> Result<String, BatchError> {

@@ -14,7 +14,7 @@ use super::{
     world::World,
 };
 use crate::{
-    grpc::{CallError, host::Host, interact::INLINE_ENVS},
+    grpc::{CallError, aside::Aside, host::Host, interact::INLINE_ENVS},
     sessions::{Guard, SessionError, SessionId},
     sim::options::shortened,
 };
@@ -72,6 +72,8 @@ pub struct Process {
     shutdown: Pin<Box<WaitForCancellationFutureOwned>>,
     interrupt_sender: InterruptSender,
     interrupts: mpsc::Receiver<Interrupt>,
+    /// Rings where somebody wants to see the world.
+    wished: Aside,
     /// Memory of the answers, used again once they are sent.
     frame: BytesMut,
 }
@@ -90,6 +92,7 @@ impl Process {
             host,
             interrupt_sender,
             interrupts,
+            wished: Aside::new(),
             frame: BytesMut::new(),
         }
     }
@@ -107,6 +110,9 @@ impl Process {
                         seat.interrupt(interrupt, &self.host);
                     }
                 }
+                () = self.wished.rung() => if let Some(seat) = &self.seat {
+                    seat.show();
+                },
                 () = &mut self.shutdown => return Err(CallError::ShuttingDown.into()),
                 () = &mut self.idle, if self.seat.is_some() => self.expire_if_idle(),
             }
@@ -205,12 +211,14 @@ impl Process {
         };
         if !costly && seat.num_envs() <= INLINE_ENVS {
             let outcome = work(&mut seat, &self.host, &mut self.frame);
+            seat.show();
             self.seat = Some(seat);
             return Ok(outcome);
         }
         let (host, mut frame) = (Arc::clone(&self.host), std::mem::take(&mut self.frame));
         let done = off_thread(move || {
             let outcome = work(&mut seat, &host, &mut frame);
+            seat.show();
             Ok((seat, frame, outcome))
         });
         // Should that panic, the world is gone.
@@ -247,6 +255,7 @@ impl Process {
         let changes = Changes::from_settings(Settings::new(request.settings))?;
         let owner = Arc::new(self.interrupt_sender.clone());
         let guard = self.host.sessions.take(id, Instant::now(), Some(owner))?;
+        guard.set_waker(self.wished.waker().clone());
         let host = Arc::clone(&self.host);
         let seat = off_thread(move || Seat::take(guard, changes, &host)).await?;
         let specs = seat.specs().to_proto();

@@ -62,6 +62,11 @@ impl Seat {
         self.guard.id()
     }
 
+    /// Lets viewers see the world as it is now.
+    pub fn show(&self) {
+        self.guard.show();
+    }
+
     /// How long the world outlives its last use.
     pub fn lease(&self) -> Duration {
         self.guard.lease()

@@ -3,7 +3,7 @@
 //! Invariant: what is changed while a sequence runs holds from the next one on.
 
 use crate::{
-    batch::{Batch, BatchError, BatchOptions, Seeds, StepBuffers},
+    batch::{Batch, BatchError, BatchOptions, Moment, Picture, Seeds, StepBuffers},
     registry::{Environment, Options},
     sim::{EnvSpec, InfoColumn},
 };
@@ -22,12 +22,15 @@ pub struct World {
     reseed: bool,
     /// What the batch of the next sequence is made from, where it is another one.
     next: Option<(Arc<dyn Environment>, BatchOptions)>,
+    /// Steps, and steps and resets, of all its batches.
+    steps: u64,
+    changes: u64,
 }
 
 impl World {
     /// A world that was never reset.
     pub fn new(batch: Box<dyn Batch>, batched: bool, given: Options, seed: Option<u64>) -> Self {
-        Self { batch, batched, given, seed, reseed: seed.is_some(), next: None }
+        Self { batch, batched, given, seed, reseed: seed.is_some(), next: None, steps: 0, changes: 0 }
     }
 
     /// The world that a session holds, if it holds one.
@@ -113,15 +116,27 @@ impl Batch for World {
         };
         let buffers = self.batch.reset(seeds, mask)?;
         self.reseed = false;
+        self.changes += 1;
         Ok(buffers)
     }
 
     fn step(&mut self, actions: &[u8]) -> Result<&StepBuffers, BatchError> {
-        self.batch.step(actions)
+        let buffers = self.batch.step(actions)?;
+        self.steps += 1;
+        self.changes += 1;
+        Ok(buffers)
     }
 
     fn tabular_state(&self, index: usize) -> Result<u32, BatchError> {
         self.batch.tabular_state(index)
+    }
+
+    fn moment(&self, index: usize) -> Result<Moment, BatchError> {
+        Ok(Moment { steps: self.steps, changes: self.changes, ..self.batch.moment(index)? })
+    }
+
+    fn picture(&self, index: usize) -> Result<Box<dyn Picture>, BatchError> {
+        self.batch.picture(index)
     }
 
     fn render_text(&self, index: usize) -> Result<String, BatchError> {

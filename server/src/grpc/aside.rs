@@ -5,11 +5,12 @@
 
 use futures_util::task::AtomicWaker;
 use std::{
+    future::poll_fn,
     sync::{
         Arc,
         atomic::{AtomicBool, Ordering},
     },
-    task::{Context, Wake, Waker},
+    task::{Context, Poll, Wake, Waker},
 };
 
 /// Wakes the task that listens, and remembers that it did.
@@ -49,6 +50,11 @@ impl Aside {
         // First the task, then the question: a bell that rings in between wakes it.
         self.bell.task.register(cx.waker());
         self.bell.rung.swap(false, Ordering::AcqRel)
+    }
+
+    /// Waits until it rings.
+    pub async fn rung(&self) {
+        poll_fn(|cx| if self.has_rung(cx) { Poll::Ready(()) } else { Poll::Pending }).await;
     }
 
     /// Rings the bell.

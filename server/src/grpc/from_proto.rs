@@ -182,7 +182,7 @@ pub fn rollout(request: &pb::RolloutRequest, spec: &EnvSpec, limits: &RolloutLim
 }
 
 /// How to draw.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum RenderMode {
     Ansi,
     RgbArray,

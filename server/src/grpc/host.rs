@@ -1,6 +1,6 @@
 //! What every call of a server shares.
 
-use super::status::CallError;
+use super::{status::CallError, watch::Gallery};
 use crate::{
     batch::{BatchOptions, Layout},
     config::Config,
@@ -27,6 +27,8 @@ pub struct Host {
     pub rollouts: Arc<Semaphore>,
     /// A permit a model that is looked up or computed.
     models: Semaphore,
+    /// Who watches what.
+    pub gallery: Gallery,
     /// Cancelled when the server is told to stop.
     pub shutdown: CancellationToken,
 }
@@ -38,6 +40,7 @@ impl Host {
             sessions: Arc::new(Sessions::new(config.limits())),
             rollouts: Arc::new(Semaphore::new(config.max_concurrent_rollouts)),
             models: Semaphore::new(config.max_concurrent_models.max(1)),
+            gallery: Gallery::default(),
             config,
             shutdown,
         }

@@ -281,6 +281,7 @@ impl Interaction {
                 let guard = self.host.sessions.take(id, Instant::now(), Some(owner))?;
                 self.lease = guard.lease();
                 self.idle.as_mut().reset((Instant::now() + self.lease).into());
+                guard.set_waker(self.aside.waker().clone());
                 self.aside.waker().wake_by_ref();
                 self.held.insert(guard)
             }
@@ -303,6 +304,7 @@ impl Interaction {
             }
             let begun = Instant::now();
             work(&mut **guard, &request, &mut self.out)?;
+            guard.show();
             self.last_used = Instant::now();
             self.took = Some(self.last_used - begun);
         } else if !self.out.is_empty() {
@@ -320,6 +322,7 @@ impl Interaction {
     }
 
     fn take_back(&mut self, (guard, out, outcome, took): Done) {
+        guard.show();
         (self.held, self.out) = (Some(guard), out);
         (self.last_used, self.took) = (Instant::now(), Some(took));
         self.phase = Phase::Reading;
@@ -332,6 +335,9 @@ impl Interaction {
     fn look_aside(&mut self) {
         let waker = self.aside.waker().clone();
         let mut cx = Context::from_waker(&waker);
+        if let Some(guard) = &self.held {
+            guard.show();
+        }
         while let Poll::Ready(Some(job)) = self.draw_jobs.poll_recv(&mut cx) {
             let picture = match &self.held {
                 Some(guard) => draw(&**guard, job.index, job.mode),

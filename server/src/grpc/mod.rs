@@ -1,6 +1,6 @@
 //! The gRPC face: decoding, calling, encoding, and nothing that computes.
 
-mod aside;
+pub(crate) mod aside;
 mod from_proto;
 pub(crate) mod host;
 pub(crate) mod interact;
@@ -9,6 +9,7 @@ mod serve;
 mod service;
 mod status;
 mod to_proto;
+mod watch;
 mod workers;
 
 pub use serve::{ServeError, serve};

@@ -5,7 +5,7 @@ use super::{
     host::{Host, blocking},
     interact::{self, DrawJob, DrawSender},
     status::CallError,
-    to_proto,
+    to_proto, watch,
 };
 use crate::{
     raster::{Format, rasterise},
@@ -32,6 +32,7 @@ impl EnvironmentService for EnvironmentGrpc {
     type InteractStream = stream::Empty<Result<pb::InteractResponse, Status>>;
     type RolloutStream = Answers<pb::RolloutResponse>;
     type GetModelStream = Answers<pb::GetModelResponse>;
+    type WatchStream = Answers<pb::WatchResponse>;
 
     async fn list_environments(
         &self,
@@ -110,6 +111,10 @@ impl EnvironmentService for EnvironmentGrpc {
         let (id, mode) = (from_proto::session_id(&request.session_id)?, from_proto::render_mode(request.mode)?);
         let drawing = draw(&self.0, id, request.index as usize, mode).await?;
         Ok(Response::new(finish(drawing, mode).await?))
+    }
+
+    async fn watch(&self, request: Request<pb::WatchRequest>) -> Result<Response<Self::WatchStream>, Status> {
+        Ok(Response::new(watch::watch(&self.0, request.get_ref())?.boxed()))
     }
 
     async fn close_session(

@@ -39,6 +39,7 @@ from mazeway.model import Model
 from mazeway.recorder import Recorder
 from mazeway.trajectory import Trajectory
 from mazeway.vector import MazewayVectorEnv
+from mazeway.watching import Frame, watch
 
 __version__ = "0.1.0"
 
@@ -50,6 +51,7 @@ __all__ = [
     "Environment",
     "Fit",
     "FitSummary",
+    "Frame",
     "InvalidArgumentError",
     "Learner",
     "LimitReachedError",
@@ -71,6 +73,7 @@ __all__ = [
     "Trajectory",
     "UnsupportedError",
     "WrongStateError",
+    "watch",
 ]
 
 for _name, _steps in REGISTERED.items():

@@ -7,6 +7,7 @@ channel go before a fork and connects again, in parent and child alike, with the
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import threading
 import time
@@ -66,8 +67,11 @@ class GrpcTransport:
         with self._translated(timeout), self._lock:
             return self._callable(method)(request, timeout=timeout)
 
-    def responses(self, method: str, request: Any, *, timeout: float) -> Iterator[Any]:
+    def responses(self, method: str, request: Any, *, timeout: float, each: bool = False) -> Iterator[Any]:
         """See `Transport`."""
+        if each:
+            yield from self._patient_responses(method, request, timeout)
+            return
         with self._translated(timeout), self._counted():
             with self._lock:
                 call = self._callable(method)(request, timeout=timeout)
@@ -75,6 +79,19 @@ class GrpcTransport:
                 yield from call
             finally:
                 call.cancel()
+
+    def _patient_responses(self, method: str, request: Any, timeout: float) -> Iterator[Any]:
+        with self._counted():
+            with self._translated(timeout), self._lock:
+                answers = _GrpcAnswers(self, self._callable(method)(request), timeout)
+            try:
+                while True:
+                    answer = answers.next()
+                    if answer is None:
+                        return
+                    yield answer
+            finally:
+                answers.cancel()
 
     def requests(self, method: str, requests: Iterable[Any], *, timeout: float) -> Any:
         """See `Transport`."""
@@ -191,46 +208,31 @@ def _violations(error: grpc.RpcError) -> list[tuple[str, str]]:
     return violations
 
 
-class _GrpcExchange:
-    """A bidirectional stream over grpcio with a deadline on each answer.
+class _GrpcAnswers:
+    """The answers of a stream over grpcio, with a deadline on each.
 
     A gRPC deadline covers a whole stream and grpcio's iterator waits for ever, so the watchdog thread
     cancels the call when an answer is late.
     """
 
-    def __init__(
-        self,
-        transport: GrpcTransport,
-        method: Callable[..., Any],
-        timeout: float,
-        lock: contextlib.AbstractContextManager[Any],
-    ) -> None:
+    def __init__(self, transport: GrpcTransport, call: Any, timeout: float) -> None:
         self._transport = transport
-        self._lock = lock
         self.alive = True
-        self._requests: SimpleQueue[Any] = SimpleQueue()
-        self._call = method(iter(self._requests.get, None))
+        self._call = call
         self.timeout = timeout
         self.waiting_since: float | None = None
         self.expired = False
-        _watchdog.watch(self)
+        if timeout < math.inf:
+            _watchdog.watch(self)
 
-    def send(self, request: Any) -> None:
-        self._requests.put(request)
-
-    def receive(self) -> Any:
-        with self._lock:
-            return self._receive()
-
-    def _receive(self) -> Any:
+    def next(self) -> Any:
+        """The next answer; None where there are no more."""
         self.waiting_since = time.monotonic()
         answer = None
         try:
             answer = next(self._call)
         except StopIteration:
-            raise ServerFailureError(
-                f"the server at {self._transport.address} ended the stream without an answer"
-            ) from None
+            return None
         except grpc.RpcError as error:
             if self.expired:
                 raise late(self._transport.address, self.timeout) from None
@@ -243,8 +245,38 @@ class _GrpcExchange:
 
     def cancel(self) -> None:
         self.alive = False
-        self._requests.put(None)  # ends the request iterator and so grpcio's thread
         self._call.cancel()
+
+
+class _GrpcExchange(_GrpcAnswers):
+    """A bidirectional stream over grpcio with a deadline on each answer."""
+
+    def __init__(
+        self,
+        transport: GrpcTransport,
+        method: Callable[..., Any],
+        timeout: float,
+        lock: contextlib.AbstractContextManager[Any],
+    ) -> None:
+        self._lock = lock
+        self._requests: SimpleQueue[Any] = SimpleQueue()
+        super().__init__(transport, method(iter(self._requests.get, None)), timeout)
+
+    def send(self, request: Any) -> None:
+        self._requests.put(request)
+
+    def receive(self) -> Any:
+        with self._lock:
+            answer = self.next()
+        if answer is None:
+            raise ServerFailureError(
+                f"the server at {self._transport.address} ended the stream without an answer"
+            )
+        return answer
+
+    def cancel(self) -> None:
+        self._requests.put(None)  # ends the request iterator and so grpcio's thread
+        super().cancel()
 
 
 class _Watchdog:
@@ -255,12 +287,12 @@ class _Watchdog:
 
     def forget(self) -> None:
         """Starts afresh, as a forked child must: the thread and the calls are its parent's."""
-        self._exchanges: weakref.WeakSet[_GrpcExchange] = weakref.WeakSet()
+        self._exchanges: weakref.WeakSet[_GrpcAnswers] = weakref.WeakSet()
         self._lock = threading.Lock()
         self._thread: threading.Thread | None = None
         self._wake = threading.Event()
 
-    def watch(self, exchange: _GrpcExchange) -> None:
+    def watch(self, exchange: _GrpcAnswers) -> None:
         with self._lock:
             self._exchanges.add(exchange)
             if self._thread is None:

@@ -46,7 +46,7 @@ class NativeTransport:
             answer = self.channel().unary(called.path, request.SerializeToString(), timeout)
         return called.response.FromString(answer)
 
-    def responses(self, method: str, request: Any, *, timeout: float) -> Iterator[Any]:
+    def responses(self, method: str, request: Any, *, timeout: float, each: bool = False) -> Iterator[Any]:
         """See `Transport`."""
         called = self._methods[method]
         deadline = time.monotonic() + timeout
@@ -55,7 +55,8 @@ class NativeTransport:
         try:
             while True:
                 with self.translated(timeout):
-                    answer = answers.receive(max(deadline - time.monotonic(), 0.0))
+                    left = timeout if each else max(deadline - time.monotonic(), 0.0)
+                    answer = answers.receive(left)
                 if answer is None:
                     return
                 yield called.response.FromString(answer)

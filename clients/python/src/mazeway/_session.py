@@ -144,6 +144,13 @@ class Session:
         self._ensure()
         return self.spec
 
+    @property
+    def session_id(self) -> str:
+        """The server's name of the session, which is made where there is none."""
+        self._ensure()
+        assert self._connection is not None
+        return self._connection.session_id
+
     def reset(
         self,
         *,

@@ -59,8 +59,11 @@ class Transport(Protocol):
     def unary(self, method: str, request: Any, *, timeout: float) -> Any:
         """One request, one answer."""
 
-    def responses(self, method: str, request: Any, *, timeout: float) -> Iterator[Any]:
-        """One request, many answers. Closing the iterator cancels the call."""
+    def responses(self, method: str, request: Any, *, timeout: float, each: bool = False) -> Iterator[Any]:
+        """One request, many answers. Closing the iterator cancels the call.
+
+        The timeout is for the whole call, or with `each` for the wait for any one answer.
+        """
 
     def requests(self, method: str, requests: Iterable[Any], *, timeout: float) -> Any:
         """Many requests, one answer."""

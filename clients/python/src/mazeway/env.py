@@ -157,6 +157,11 @@ class MazewayEnv(gymnasium.Env[Any, Any]):
             return None
         return render(self._session, 0, self.render_mode)
 
+    @property
+    def session_id(self) -> str:
+        """Name of the session on the server. Whoever knows it can watch it, and take it over."""
+        return self._session.session_id
+
     def close(self) -> None:
         """Ends the session on the server; may be called twice."""
         self._session.close()

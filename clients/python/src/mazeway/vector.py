@@ -176,6 +176,11 @@ class MazewayVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             return None
         return tuple(render(self._session, i, self.render_mode) for i in range(self.num_envs))
 
+    @property
+    def session_id(self) -> str:
+        """Name of the session on the server. Whoever knows it can watch it, and take it over."""
+        return self._session.session_id
+
     def close_extras(self, **_kwargs: Any) -> None:
         """Ends the session on the server."""
         if hasattr(self, "_session"):  # Gymnasium 1.0 closes what failed to be made, too

@@ -84,7 +84,7 @@ pub fn in_rounds(subjects: &mut [Subject], rounds: usize, slice: Duration) -> Ve
 /// All figures, as the object that `--json` writes.
 pub struct Report(Value);
 
-const LISTS: [&str; 6] = ["round_trips", "pipelined", "batches", "ratios", "memory", "scale"];
+const LISTS: [&str; 7] = ["round_trips", "pipelined", "batches", "ratios", "memory", "scale", "watching"];
 
 /// What is promised of one figure over another.
 const LIMITS: [(&str, &str, Option<f64>); 6] = [
@@ -159,6 +159,14 @@ impl Report {
                     push(&mode, format!("{env} x {num_envs}: echo / vector_env_step"), echo / ours, None);
                 }
             }
+            for record in self.list("watching").filter(|r| r["mode"] == mode && r["name"] == "unwatched") {
+                let (env, watched) = (&record["env"], json!("watched"));
+                let watched = self.median("watching", &[("mode", &mode), ("env", env), ("name", &watched)]);
+                if let (Some(watched), Some(unwatched)) = (watched, record["median"].as_f64()) {
+                    let name = format!("{}: watched / unwatched", env.as_str().unwrap_or_default());
+                    push(&mode, name, watched / unwatched, None);
+                }
+            }
         }
         self.0["ratios"] = ratios.into();
     }
@@ -191,6 +199,8 @@ impl Report {
         table("batches", "Steps a second of a batch", &batch);
         table("ratios", "Ratios", &["mode", "name", "value", "limit", "met"]);
         table("memory", "Memory of the server, bytes", &["name", "env", "count", "bytes", "limit", "met"]);
+        let watching = ["mode", "env", "name", "median", "low", "high", "pictures"];
+        table("watching", "Round trip of one step with and without viewers, µs", &watching);
         table("scale", "Steps a second of many sessions together", &["sessions", "median", "low", "high"]);
         out
     }

@@ -18,12 +18,14 @@
 //! | `ratios` | `mode`, `name`, `value`, `limit` (null where none is promised), `met` |
 //! | `memory` | `name`, `env`, `count`, `bytes`, `limit`, `met`: resident bytes of the server for one of `name` |
 //! | `scale` | `sessions`, `median`, `low`, `high`: steps a second of all together, each with a stream of its own |
+//! | `watching` | `mode`, `env`, `name`, `median`, `low`, `high`, `pictures`: µs from a step's request to its answer; pictures read |
 //!
 //! and beside them `benchmark` ("wire"), `cores`, `cpu`, `rounds`. Names in `round_trips`: `raw_tcp`, `raw_unix` (blocking
 //! sockets, the floor), `tonic_bidi_tcp`, `tonic_bidi_unix`, `tonic_bidi_tcp_multi_thread` (server on tokio's
 //! multi-threaded runtime), `tonic_unary_tcp`, `env_step_tcp`, `env_step_unix` ([`mazeway_client::Env::step`]),
 //! `env_step_tcp_multi_thread` (the client on that runtime), `unary_step_tcp` (the RPC `Step`). In `batches`:
-//! `vector_env_step` and `tonic_bidi_echo`, which carries the same number of bytes either way.
+//! `vector_env_step` and `tonic_bidi_echo`, which carries the same number of bytes either way. In `watching`:
+//! `unwatched` and `watched`, by fifty viewers of whom forty read nothing.
 
 mod figures;
 mod memory;
@@ -31,6 +33,7 @@ mod peers;
 mod process;
 mod round_trips;
 mod throughput;
+mod watching;
 
 use clap::{Parser, ValueEnum};
 use figures::Report;
@@ -56,6 +59,7 @@ enum Part {
     Batches,
     Memory,
     Scale,
+    Watching,
 }
 
 #[derive(Debug, Parser)]
@@ -68,7 +72,7 @@ struct Cli {
     #[arg(long, value_delimiter = ',', default_value = "pinned,idle")]
     modes: Vec<Mode>,
     /// Which parts; memory and scale are measured in mode `idle`.
-    #[arg(long, value_delimiter = ',', default_value = "round_trips,pipelined,batches,memory,scale")]
+    #[arg(long, value_delimiter = ',', default_value = "round_trips,pipelined,batches,memory,scale,watching")]
     parts: Vec<Part>,
     /// Rounds of every figure.
     #[arg(long, default_value_t = 9)]
@@ -169,6 +173,7 @@ fn measure(setting: &Setting, parts: &[Part]) -> Report {
             Part::Batches => throughput::batches(setting, &mut report),
             Part::Memory => memory::measure(setting, &mut report),
             Part::Scale => memory::scale(setting, &mut report),
+            Part::Watching => watching::measure(setting, &mut report),
         }
     }
     report

@@ -1,0 +1,105 @@
+"""`watch`: pictures of a session as they change, whoever steps it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium
+import numpy as np
+import numpy.typing as npt
+
+from mazeway import _arrays, _wire
+from mazeway._session import DEFAULT_ADDRESS
+from mazeway._transport import Transport, connect
+from mazeway.env import MazewayEnv
+from mazeway.errors import InvalidArgumentError
+from mazeway.vector import MazewayVectorEnv
+
+#: What pictures may be.
+MODES = ("ansi", "rgb_array", "png")
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """A picture and when it was."""
+
+    #: Text, an array of shape (height, width, 3), or the bytes of a PNG file, as the mode says.
+    content: str | bytes | npt.NDArray[np.uint8] = field(repr=False)
+    #: Steps of the session so far.
+    step: int
+    #: Steps of the environment's present episode so far.
+    episode_step: int
+    #: Whether that episode has ended and no other has begun.
+    episode_ended: bool
+    #: Steps and resets since the picture before that were not shown.
+    skipped: int
+
+
+def watch(
+    what: str | gymnasium.Env[Any, Any] | gymnasium.vector.VectorEnv[Any, Any, Any],
+    index: int = 0,
+    *,
+    mode: str = "rgb_array",
+    max_fps: float = 0.0,
+    max_width: int = 0,
+    address: str | None = None,
+    timeout: float | None = None,
+    client: str = "auto",
+) -> Iterator[Frame]:
+    """Pictures of one environment of a session: the present one, then others as it changes.
+
+    They come over a connection of their own and end with the session. Whoever reads slowly is shown fewer
+    of them; the session never waits.
+
+    Args:
+        what: A Mazeway environment or vector environment, wrapped or not, or the id of a session
+            (`env.unwrapped.session_id`).
+        index: Which environment of the batch.
+        mode: "ansi", "rgb_array" or "png".
+        max_fps: Pictures a second at most, up to 60; 0 is the environment's own `render_fps`.
+        max_width: Pixels across at most, not for "ansi"; 0 is as wide as the environment draws.
+        address: "host:port" of the server; None is the environment's own.
+        timeout: Longest wait for a change, in seconds; None waits as long as the session lives.
+        client: "native", "grpc", or "auto" for the native one where it is built.
+    """
+    if mode not in MODES:
+        raise InvalidArgumentError(f"mode: expected one of {MODES}, got {mode!r}", field="mode")
+    if index < 0 or max_width < 0:
+        name, value = ("index", index) if index < 0 else ("max_width", max_width)
+        raise InvalidArgumentError(f"{name}: expected at least 0, got {value}", field=name)
+    session_id: str
+    if isinstance(what, str):
+        session_id, address = what, address or DEFAULT_ADDRESS
+    else:
+        env = what.unwrapped
+        if not isinstance(env, (MazewayEnv, MazewayVectorEnv)):
+            raise InvalidArgumentError(
+                f"what: expected an environment of Mazeway or the id of a session, got {what!r}", field="what"
+            )
+        session_id, address = env.session_id, address or env.address
+    request = _wire.env.WatchRequest(
+        session_id=session_id,
+        index=index,
+        mode=_wire.env.RenderMode[f"RENDER_MODE_{mode.upper()}"],
+        max_fps=max_fps,
+        max_width=max_width,
+    )
+    transport = connect(address, _wire.ENVIRONMENT_SERVICE, client)
+    return _frames(transport, request, mode, math.inf if timeout is None else timeout)
+
+
+def _frames(transport: Transport, request: Any, mode: str, timeout: float) -> Iterator[Frame]:
+    try:
+        for answer in transport.responses("Watch", request, timeout=timeout, each=True):
+            content = answer.content
+            if mode == "ansi":
+                content = content.decode()
+            elif mode == "rgb_array":
+                shape = (answer.height, answer.width, 3)
+                content = _arrays.unpack(content, _arrays.UINT8, shape, "content")
+            yield Frame(content, answer.step, answer.episode_step, answer.episode_ended, answer.skipped)
+    finally:
+        transport.close()

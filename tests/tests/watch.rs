@@ -177,7 +177,7 @@ async fn fifty_viewers_of_whom_forty_read_nothing_change_nothing() {
     for reader in readers {
         let (pictures, changes) = reader.await.expect("a reader");
         // Far fewer pictures than steps, and what they skipped accounts for the rest: resets are changes too.
-        assert!(pictures >= 3 && pictures <= 60 * 30, "{pictures} pictures");
+        assert!((3..=60 * 30).contains(&pictures), "{pictures} pictures");
         assert!(changes <= steps + steps / 100 + 2 && changes > pictures, "{changes} changes in {steps} steps");
     }
     // One who read nothing finds some old pictures, and then the end.

@@ -255,8 +255,10 @@ impl<'a> Subject<'a> {
                 for contents in &after {
                     add(&mut allowed, Rc::clone(contents));
                 }
-                self.allowed = allowed.clone();
-                during.into_iter().for_each(|contents| add(&mut allowed, contents));
+                self.allowed.clone_from(&allowed);
+                for contents in during {
+                    add(&mut allowed, contents);
+                }
                 self.within(from, to, allowed);
                 self.visible = self.look(&after)?;
             }

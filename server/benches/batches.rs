@@ -9,9 +9,9 @@ use mazeway_server::{
     sim::rng::{Purpose, below, stream},
 };
 use serde_json::{Value, json};
-use std::time::Duration;
+use std::{sync::Arc, time::Duration};
 
-fn environment(env_id: &str, options: Value) -> std::sync::Arc<dyn Environment> {
+fn environment(env_id: &str, options: Value) -> Arc<dyn Environment> {
     Registry::new().configure(env_id, options.as_object().expect("an object")).expect("valid options")
 }
 
@@ -25,7 +25,7 @@ fn steps(criterion: &mut Criterion, name: &str, env_id: &str, options: Value, au
         let actions: Vec<u8> = (0..num_envs).flat_map(|_| below(&mut rng, spec.n_actions).to_le_bytes()).collect();
         let options =
             BatchOptions { num_envs, autoreset, max_episode_steps: spec.max_episode_steps, action_masks: false };
-        let mut batch = environment.batch(options);
+        let mut batch = Arc::clone(&environment).batch(options);
         batch.reset(Seeds::From(0), None).expect("resets");
         group.throughput(Throughput::Elements(num_envs as u64));
         for threads in [1, 2] {

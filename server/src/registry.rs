@@ -1,7 +1,8 @@
 //! The catalogue: environments by id, configured by options, behind one face whatever their kind.
 //!
-//! Invariant: a tabular model is computed once for each environment and set of options, even where many ask at a time,
-//! and the cache is bounded. Deliberately absent: transports and sessions.
+//! Invariants: environments of equal options that are in use at a time are one and the same, so that a session pays for its
+//! state alone; one that nobody uses is freed. A tabular model is computed once for each environment and set of options,
+//! even where many ask at a time, and the cache of models is bounded. Deliberately absent: transports and sessions.
 
 use crate::{
     batch::{Batch, BatchOptions, SimBatch},
@@ -10,8 +11,9 @@ use crate::{
 };
 use serde_json::{Map, Value};
 use std::{
+    collections::HashMap,
     fmt,
-    sync::{Arc, Mutex, OnceLock, PoisonError},
+    sync::{Arc, Mutex, OnceLock, PoisonError, Weak},
 };
 
 /// Options by name.
@@ -20,12 +22,15 @@ pub type Options = Map<String, Value>;
 /// Models kept at a time; the least recently used one goes first.
 const CACHED_MODELS: usize = 16;
 
+/// Environments in use at which those are looked for that nobody uses any more; afterwards at twice as many as are left.
+const SWEEP_AT: usize = 64;
+
 /// A configured environment.
 pub trait Environment: Send + Sync {
     /// Its description under the options.
     fn spec(&self) -> &Arc<EnvSpec>;
     /// A batch that was never reset.
-    fn batch(&self, options: BatchOptions) -> Box<dyn Batch>;
+    fn batch(self: Arc<Self>, options: BatchOptions) -> Box<dyn Batch>;
     /// Runs a checked plan; see [`roll_out`].
     fn roll_out(
         &self,
@@ -37,18 +42,30 @@ pub trait Environment: Send + Sync {
     fn compute_model(&self) -> TabularModel;
 }
 
-struct Kind<S> {
-    configured: Configured<S>,
-    model: fn(&Configured<S>) -> TabularModel,
+/// A simulator whose tabular model can be computed.
+trait Tabular: Simulator {
+    fn model(configured: &Configured<Self>) -> TabularModel;
 }
 
-impl<S: Simulator> Environment for Kind<S> {
+impl Tabular for highway::Highway {
+    fn model(configured: &Configured<Self>) -> TabularModel {
+        configured.model()
+    }
+}
+
+impl Tabular for maze::Maze {
+    fn model(configured: &Configured<Self>) -> TabularModel {
+        configured.model()
+    }
+}
+
+impl<S: Tabular> Environment for Configured<S> {
     fn spec(&self) -> &Arc<EnvSpec> {
-        &self.configured.spec
+        &self.spec
     }
 
-    fn batch(&self, options: BatchOptions) -> Box<dyn Batch> {
-        Box::new(SimBatch::new(&self.configured, options))
+    fn batch(self: Arc<Self>, options: BatchOptions) -> Box<dyn Batch> {
+        Box::new(SimBatch::new(self, options))
     }
 
     fn roll_out(
@@ -57,15 +74,15 @@ impl<S: Simulator> Environment for Kind<S> {
         cancelled: &(dyn Fn() -> bool + Sync),
         emit: &mut dyn FnMut(EpisodeChunk) -> bool,
     ) {
-        roll_out(&self.configured, plan, cancelled, emit);
+        roll_out(self, plan, cancelled, emit);
     }
 
     fn compute_model(&self) -> TabularModel {
-        (self.model)(&self.configured)
+        S::model(self)
     }
 }
 
-type Configure = Box<dyn Fn(&Options) -> Result<Arc<dyn Environment>, OptionError> + Send + Sync>;
+type Configure = fn(&Options) -> Result<Arc<dyn Environment>, OptionError>;
 
 struct Entry {
     env_id: &'static str,
@@ -91,6 +108,7 @@ pub enum RegistryError {
 /// The catalogue, in alphabetical order of the ids.
 pub struct Registry {
     entries: Vec<Entry>,
+    in_use: InUse,
     models: ModelCache,
 }
 
@@ -109,23 +127,12 @@ impl fmt::Debug for Registry {
 impl Registry {
     /// All environments of this crate.
     pub fn new() -> Self {
-        let mut registry = Self { entries: Vec::new(), models: ModelCache::default() };
-        registry.register(highway::ENV_ID, highway::configure, Configured::<highway::Highway>::model);
-        registry.register(maze::ENV_ID, maze::configure, Configured::<maze::Maze>::model);
-        registry
-    }
-
-    fn register<S: Simulator>(
-        &mut self,
-        env_id: &'static str,
-        configure: fn(&Options) -> Result<Configured<S>, OptionError>,
-        model: fn(&Configured<S>) -> TabularModel,
-    ) {
-        let configure: Configure = Box::new(move |options| {
-            Ok(Arc::new(Kind { configured: configure(options)?, model }) as Arc<dyn Environment>)
-        });
-        self.entries.push(Entry { env_id, configure });
-        self.entries.sort_by_key(|entry| entry.env_id);
+        let mut entries = vec![
+            Entry { env_id: highway::ENV_ID, configure: |options| Ok(Arc::new(highway::configure(options)?)) },
+            Entry { env_id: maze::ENV_ID, configure: |options| Ok(Arc::new(maze::configure(options)?)) },
+        ];
+        entries.sort_by_key(|entry| entry.env_id);
+        Self { entries, in_use: InUse::default(), models: ModelCache::default() }
     }
 
     /// Ids in alphabetical order.
@@ -133,7 +140,8 @@ impl Registry {
         self.entries.iter().map(|entry| entry.env_id)
     }
 
-    /// An environment under options; those not given take their defaults.
+    /// An environment under options; those not given take their defaults. As long as somebody keeps it, or a batch of it,
+    /// whoever asks for equal options gets the same.
     ///
     /// # Errors
     /// No such environment, a wrong option.
@@ -143,7 +151,12 @@ impl Registry {
             env_id: shortened(env_id),
             known: self.env_ids().collect(),
         })?;
-        Ok((entry.configure)(options)?)
+        let key = given_key(entry.env_id, options);
+        if let Some(environment) = self.in_use.get(&key) {
+            return Ok(environment);
+        }
+        // Made without the lock, for it may take a while; of two who make the same, the first is kept.
+        Ok(self.in_use.insert(key, (entry.configure)(options)?))
     }
 
     /// Every environment with default options, in alphabetical order.
@@ -164,19 +177,61 @@ impl Registry {
     }
 }
 
-/// The id and every option, given or default, numbers as floating point: equal for equal configurations.
-fn cache_key(spec: &EnvSpec, given: &Options) -> String {
-    fn canonical(value: &Value) -> Value {
-        match value {
-            Value::Number(number) => number.as_f64().map_or_else(|| value.clone(), Value::from),
-            Value::Array(items) => items.iter().map(canonical).collect(),
-            Value::Object(map) => map.iter().map(|(key, value)| (key.clone(), canonical(value))).collect(),
-            Value::Null | Value::Bool(_) | Value::String(_) => value.clone(),
-        }
+/// Numbers as floating point, so that two spellings of one are equal.
+fn canonical(value: &Value) -> Value {
+    match value {
+        Value::Number(number) => number.as_f64().map_or_else(|| value.clone(), Value::from),
+        Value::Array(items) => items.iter().map(canonical).collect(),
+        Value::Object(map) => map.iter().map(|(key, value)| (key.clone(), canonical(value))).collect(),
+        Value::Null | Value::Bool(_) | Value::String(_) => value.clone(),
     }
+}
+
+fn canonical_options(given: &Options) -> impl Iterator<Item = (String, Value)> {
+    given.iter().map(|(name, value)| (name.clone(), canonical(value)))
+}
+
+/// The id and the options that were given: equal for configurations asked for alike.
+fn given_key(env_id: &str, given: &Options) -> String {
+    format!("{env_id} {}", Value::Object(canonical_options(given).collect()))
+}
+
+/// The id and every option, given or default: equal for equal configurations.
+fn cache_key(spec: &EnvSpec, given: &Options) -> String {
     let mut options: Options = spec.options.iter().map(|o| (o.name.to_owned(), canonical(&o.default))).collect();
-    options.extend(given.iter().map(|(name, value)| (name.clone(), canonical(value))));
+    options.extend(canonical_options(given));
     format!("{} {}", spec.env_id, Value::Object(options))
+}
+
+/// Environments that somebody keeps, by what was asked for; bounded by the number of those who keep them.
+#[derive(Default)]
+struct InUse(Mutex<Kept>);
+
+#[derive(Default)]
+struct Kept {
+    environments: HashMap<String, Weak<dyn Environment>>,
+    sweep_at: usize,
+}
+
+impl InUse {
+    fn get(&self, key: &str) -> Option<Arc<dyn Environment>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).environments.get(key)?.upgrade()
+    }
+
+    /// Keeps `made`, unless another was quicker: then it gives back that one.
+    fn insert(&self, key: String, made: Arc<dyn Environment>) -> Arc<dyn Environment> {
+        let mut kept = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(other) = kept.environments.get(&key).and_then(Weak::upgrade) {
+            return other;
+        }
+        if kept.environments.len() >= kept.sweep_at {
+            kept.environments.retain(|_, environment| environment.strong_count() > 0);
+            kept.environments.shrink_to(SWEEP_AT);
+            kept.sweep_at = SWEEP_AT.max(2 * kept.environments.len());
+        }
+        kept.environments.insert(key, Arc::downgrade(&made));
+        made
+    }
 }
 
 /// A key and its model, once it is computed.
@@ -242,6 +297,41 @@ mod tests {
         let none = registry.model("Maze-v0", &options(json!({"slip": 0}))).expect("known");
         let none_again = registry.model("Maze-v0", &options(json!({"slip": 0.0}))).expect("known");
         assert!(Arc::ptr_eq(&none, &none_again) && !Arc::ptr_eq(&first, &none));
+    }
+
+    #[test]
+    fn equal_options_share_an_environment_while_it_is_in_use() {
+        let registry = Registry::new();
+        let configure = |value| registry.configure("Maze-v0", &options(value)).expect("valid options");
+        let (first, slippery) = (configure(json!({"slip": 1})), configure(json!({"slip": 0.5})));
+        assert!(Arc::ptr_eq(&first, &configure(json!({"slip": 1.0}))) && !Arc::ptr_eq(&first, &slippery));
+        // A batch keeps it.
+        let watch = Arc::downgrade(&first);
+        let options = BatchOptions {
+            num_envs: 1,
+            autoreset: crate::batch::Autoreset::NextStep,
+            max_episode_steps: 0,
+            action_masks: false,
+        };
+        let batch = first.batch(options);
+        assert!(Arc::ptr_eq(&watch.upgrade().expect("kept"), &configure(json!({"slip": 1}))));
+        drop(batch);
+        assert_eq!(watch.strong_count(), 0);
+    }
+
+    #[test]
+    fn environments_that_nobody_uses_are_forgotten() {
+        let registry = Registry::new();
+        let configure = |slip: usize| {
+            registry.configure("Maze-v0", &options(json!({"slip": 1.0 / slip as f64}))).expect("valid options")
+        };
+        let used: Vec<_> = (1..=10).map(configure).collect();
+        for slip in 11..100 * SWEEP_AT {
+            configure(slip);
+        }
+        let kept = registry.in_use.0.lock().expect("not poisoned").environments.len();
+        assert!((used.len()..=SWEEP_AT + used.len()).contains(&kept), "{kept}");
+        assert!((1..=10).zip(&used).all(|(slip, environment)| Arc::ptr_eq(environment, &configure(slip))));
     }
 
     #[test]

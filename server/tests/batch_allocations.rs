@@ -5,6 +5,7 @@ use mazeway_server::{
     registry::Registry,
 };
 use serde_json::json;
+use std::sync::Arc;
 
 fn stepping_allocates(batch: &mut dyn Batch) -> u64 {
     let n_actions = batch.spec().n_actions;
@@ -33,7 +34,7 @@ fn steps_and_resets_do_not_allocate() {
         let environment = environment.expect("an environment");
         for autoreset in [Autoreset::NextStep, Autoreset::SameStep, Autoreset::Disabled] {
             let options = BatchOptions { num_envs: 5, autoreset, max_episode_steps: 7, action_masks: true };
-            let mut batch = environment.batch(options);
+            let mut batch = Arc::clone(&environment).batch(options);
             assert_eq!(stepping_allocates(&mut *batch), 0, "{env_id} {autoreset:?}");
         }
     }

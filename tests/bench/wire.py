@@ -9,9 +9,13 @@ and steps a second of batches. The cases of a mode are timed in one process, in 
 machine disturbs them all. Medians over the rounds, with the lowest and the highest beside them.
 
 Peers: a bare TCP ping-pong in Python (the floor); Gymnasium's own wrappers around an environment that does nothing; bare
-echoes by grpcio; dm_env_rpc's and OpenEnv's own servers and clients around a toy; EnvPool's FrozenLake and highway-fast,
-Gymnasium's vector environments and highway-env in process. Rust's own figures, and the floor of blocking sockets in Rust,
-are those of `cargo run --release -p mazeway-bench-wire -- --parts round_trips`, run in between.
+echoes by grpcio; dm_env_rpc's, OpenEnv's and remote-gym's own servers and clients around a toy; EnvPool's FrozenLake and highway-fast,
+Gymnasium's vector environments and highway-env in process. Rust's own figures, the floor of blocking sockets in Rust, the
+roll-outs and the memory of the server are those of `cargo run --release -p mazeway-bench-wire`, run after the others.
+
+`--json` prints one object: `round_trip_microseconds` (by mode and case) and `steps_per_second` (by case), each figure with
+`median`, `low` and `high`; `rust`, the object of the Rust benchmark; `targets`, a list of `what`, `target`, `measured`,
+`met`; `failures`, the cases that did not run and why; `rounds`, `cores`, `cpu`.
 
 FrozenLake (16 states) is compared with the maze (57 states), highway-fast (continuous kinematics, 3 lanes, fewer vehicles
 and simulation steps than highway-v0) with our highway (12 vehicles, one decision a second): by what a user gets a second,
@@ -28,6 +32,8 @@ import tempfile
 import venv
 from pathlib import Path
 
+from wire_targets import report, targets
+
 REPOSITORY = Path(__file__).resolve().parents[2]
 PEERS = Path(__file__).with_name("wire_peers.py")
 PACKAGES = [
@@ -40,6 +46,8 @@ PACKAGES = [
     "numpy==2.4.6",
     "openenv-core==0.3.0",
 ]
+# Wants an older protobuf than the others: it gets a virtual environment of its own.
+APART = {"remote-gym": ["remote-gym==0.7.3"]}
 ROUND_TRIPS = [
     "tcp",
     "gymnasium",
@@ -54,6 +62,7 @@ ROUND_TRIPS = [
     "dm_env_rpc",
     "openenv websocket",
     "openenv http",
+    "remote-gym",
 ]
 BATCHES = [
     "maze native 64",
@@ -61,6 +70,7 @@ BATCHES = [
     "maze native 16384",
     "maze grpcio 1024",
     "highway native 1024",
+    "highway kinematics native 1024",
     "highway grpcio 1024",
     "envpool frozenlake 1024",
     "envpool highway-fast 16",
@@ -71,55 +81,32 @@ BATCHES = [
     "gymnasium async 64",
     "highway-env one",
 ]
-LABELS = {
-    "tcp": "TCP ping-pong, Python sockets",
-    "gymnasium": "an empty Gymnasium environment, in process",
-    "gymnasium.make": "the same in gymnasium.make's wrappers",
-    "native": "mazeway, native, gymnasium.make",
-    "native unwrapped": "mazeway, native, without wrappers",
-    "native unix": "mazeway, native, Unix socket",
-    "grpcio": "mazeway, grpcio, gymnasium.make",
-    "grpcio unwrapped": "mazeway, grpcio, without wrappers",
-    "grpcio echo bidi": "grpcio bidi echo, bare",
-    "grpcio echo unary": "grpcio unary echo, bare",
-    "dm_env_rpc": "dm_env_rpc's own server and client",
-    "openenv websocket": "OpenEnv, WebSocket",
-    "openenv http": "OpenEnv, HTTP",
-    "maze native 64": "mazeway maze, native, 64",
-    "maze native 1024": "mazeway maze, native, 1,024",
-    "maze native 16384": "mazeway maze, native, 16,384",
-    "maze grpcio 1024": "mazeway maze, grpcio, 1,024",
-    "highway native 1024": "mazeway highway, native, 1,024",
-    "highway grpcio 1024": "mazeway highway, grpcio, 1,024",
-    "envpool frozenlake 1024": "EnvPool FrozenLake, in process, 1,024",
-    "envpool highway-fast 16": "EnvPool highway-fast, in process, 16",
-    "envpool highway-fast 1024": "EnvPool highway-fast, in process, 1,024",
-    "dm_env_rpc 1024": "dm_env_rpc's own, 1,024 as a tensor",
-    "gymnasium one": "Gymnasium FrozenLake, in process, one",
-    "gymnasium sync 64": "Gymnasium SyncVectorEnv FrozenLake, 64",
-    "gymnasium async 64": "Gymnasium AsyncVectorEnv FrozenLake, 64",
-    "highway-env one": "highway-env highway-fast-v0, in process",
-}
 
 
 def log(message):
     print(message, file=sys.stderr, flush=True)
 
 
-def prepare(directory):
-    """Python of an environment that holds the peers and the client as it is now."""
+def environment(directory, packages):
+    """Python of a virtual environment with these packages, kept from run to run."""
     python = directory / "bin" / "python"
     stamp = directory / "packages"
-    if not stamp.is_file() or stamp.read_text() != "\n".join(PACKAGES):
-        log(f"installing the peers into {directory}")
+    if not stamp.is_file() or stamp.read_text() != "\n".join(packages):
+        log(f"installing {', '.join(packages)} into {directory}")
         venv.create(directory, with_pip=True, clear=True)
-        subprocess.run([python, "-m", "pip", "install", "-q", *PACKAGES], check=True)
-        stamp.write_text("\n".join(PACKAGES))
+        subprocess.run([python, "-m", "pip", "install", "-q", *packages], check=True)
+        stamp.write_text("\n".join(packages))
+    return str(python)
+
+
+def prepare(directory):
+    """Python of an environment that holds the peers and the client as it is now."""
+    python = environment(directory, PACKAGES)
     log("building the Python client")
     client = str(REPOSITORY / "clients" / "python")
     pip = [python, "-m", "pip", "install", "-q", "--no-deps", "--force-reinstall", client]
     subprocess.run(pip, check=True, stdout=sys.stderr)
-    return str(python)
+    return python
 
 
 def build_server():
@@ -131,7 +118,7 @@ def build_server():
 class Servers:
     """Everything that answers, started for one mode."""
 
-    def __init__(self, python, binary, pin):
+    def __init__(self, python, apart, binary, pin):
         self.processes, self.ports = [], {}
         self.place = tempfile.TemporaryDirectory()
         self.ports["mazeway"] = int(self._start([*pin, binary, "--listen", "127.0.0.1:0"]).rpartition(":")[2])
@@ -139,6 +126,9 @@ class Servers:
         self._start([*pin, binary, "--listen", f"unix:{self.ports['mazeway unix']}"])
         for name in ("tcp", "grpc", "dm_env_rpc", "openenv"):
             self.ports[name] = int(self._start([*pin, python, str(PEERS), "serve", name]))
+        for name, own in apart.items():
+            self.ports[f"{name} python"] = own
+            self.ports[name] = int(self._start([*pin, own, str(PEERS), "serve", name]))
 
     def _start(self, command):
         pipe = subprocess.PIPE
@@ -158,8 +148,8 @@ class Servers:
         self.place.cleanup()
 
 
-def run(python, binary, cases, rounds, secs, pin):
-    servers = Servers(python, binary, pin)
+def run(python, apart, binary, cases, rounds, secs, pin):
+    servers = Servers(python, apart, binary, pin)
     try:
         job = {"cases": cases, "ports": servers.ports, "rounds": rounds, "secs": secs}
         command = [*pin, python, str(PEERS), "measure"]
@@ -172,70 +162,21 @@ def run(python, binary, cases, rounds, secs, pin):
 
 
 def rust_figures(binary, rounds):
-    """Round trips by mode and name, as the Rust benchmark measures them; none where it is not there."""
+    """What the Rust benchmark measures that has a target, as its own object; empty where it is not there."""
     if not (REPOSITORY / "tests" / "bench" / "wire" / "Cargo.toml").is_file():
         return {}
-    log("measuring round trips of the Rust client")
+    log("measuring the Rust client, roll-outs and memory")
     command = ["cargo", "run", "-q", "--release", "-p", "mazeway-bench-wire", "--", "--json", "-"]
-    command += ["--parts", "round_trips", "--rounds", str(rounds), "--server", binary]
+    command += ["--parts", "round_trips,rollouts,memory", "--rounds", str(rounds), "--server", binary]
     done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False)
     if done.returncode:
         log(f"the Rust benchmark failed: {done.stderr.strip()[-300:]}")
         return {}
-    figures = {}
-    for row in json.loads(done.stdout)["round_trips"]:
-        figures.setdefault(row["mode"], {})[row["name"]] = {k: row[k] for k in ("median", "low", "high")}
-    return figures
+    return json.loads(done.stdout)
 
 
 def summary(times):
     return {"median": statistics.median(times), "low": min(times), "high": max(times)}
-
-
-def table(title, unit, rows, digits):
-    """Lines of a table: label, median, lowest and highest."""
-    width = max(len(label) for label, _ in rows)
-    lines = [f"{title:<{width}}  {unit:>12}  (lowest - highest)"]
-    for label, row in rows:
-        median, low, high = (f"{row[key]:,.{digits}f}" for key in ("median", "low", "high"))
-        lines.append(f"{label:<{width}}  {median:>12}  ({low} - {high})")
-    return lines
-
-
-def ratios(modes, batches, rust):
-    """The targets, each a ratio within one run, with what it should be."""
-    found = []
-
-    def add(what, value, wanted, better):
-        met = value >= wanted if better == "at least" else value <= wanted
-        found.append({"what": what, "value": value, "target": f"{better} {wanted:g}", "met": met})
-
-    for mode, rows in modes.items():
-        at = {name: row["median"] for name, row in rows.items()}
-        wrappers = at["gymnasium.make"] - at["gymnasium"]
-        add(
-            f"{mode}: native step less wrappers, to TCP",
-            (at["native"] - wrappers) / at["tcp"],
-            2.5,
-            "at most",
-        )
-        if "dm_env_rpc" in at:
-            add(f"{mode}: dm_env_rpc to native", at["dm_env_rpc"] / at["native"], 15, "at least")
-        others = [at[name] for name in ("openenv websocket", "openenv http") if name in at]
-        if others:
-            add(f"{mode}: OpenEnv's best to native", min(others) / at["native"], 8, "at least")
-        plain = at["grpcio unwrapped"] / at["grpcio echo bidi"]
-        add(f"{mode}: grpcio client to a bare grpcio echo", plain, 1.15, "at most")
-    at = {name: row["median"] for name, row in batches.items()}
-    add("maze, 1,024: million steps a second", at["maze native 1024"] / 1e6, 10, "at least")
-    add("highway, 1,024: million steps a second", at["highway native 1024"] / 1e6, 1, "at least")
-    if "envpool frozenlake 1024" in at:
-        value = at["maze native 1024"] / at["envpool frozenlake 1024"]
-        add("maze to EnvPool's FrozenLake", value, 10, "at least")
-    fast = [at[name] for name in at if name.startswith("envpool highway-fast")]
-    if fast:
-        add("highway to EnvPool's best highway-fast", at["highway native 1024"] / max(fast), 40, "at least")
-    return found
 
 
 def main():
@@ -253,20 +194,26 @@ def main():
     parser.add_argument("--chart", type=Path, help="draw the round trips and batches into this SVG or PNG")
     arguments = parser.parse_args()
     python = arguments.python or prepare(arguments.venv)
+    apart, failures = {}, {}
+    for name, packages in APART.items():
+        try:
+            apart[name] = environment(arguments.venv.with_name(name), packages)
+        except subprocess.CalledProcessError as error:
+            failures[name] = str(error)
     binary = arguments.binary or build_server()
     skipped = tuple(filter(None, arguments.skip.split(",")))
 
     def chosen(cases):
-        return [name for name in cases if not skipped or not name.startswith(skipped)]
+        return [name for name in cases if name not in failures and not (skipped and name.startswith(skipped))]
 
-    modes, failures = {}, {}
+    modes = {}
     for mode, pin in (("pinned", ["taskset", "-c", "0"]), ("idle", [])):
         log(f"measuring round trips, {mode}")
-        said = run(python, binary, chosen(ROUND_TRIPS), arguments.rounds, arguments.secs, pin)
+        said = run(python, apart, binary, chosen(ROUND_TRIPS), arguments.rounds, arguments.secs, pin)
         modes[mode] = {name: summary(times) for name, times in said["microseconds"].items()}
         failures |= said["failures"]
     log("measuring batches")
-    said = run(python, binary, chosen(BATCHES), arguments.rounds, arguments.secs, [])
+    said = run(python, apart, binary, chosen(BATCHES), arguments.rounds, arguments.secs, [])
     failures |= said["failures"]
     batches = {}
     for name, times in said["microseconds"].items():
@@ -276,10 +223,11 @@ def main():
         "round_trip_microseconds": modes,
         "steps_per_second": batches,
         "rust": rust,
-        "ratios": ratios(modes, batches, rust),
+        "targets": targets(modes, batches, rust),
         "failures": failures,
         "rounds": arguments.rounds,
         "cores": os.cpu_count(),
+        "cpu": rust.get("cpu"),
     }
     if arguments.chart:
         code = "import json, sys; from wire_chart import draw; draw(json.load(sys.stdin), sys.argv[1])"
@@ -288,20 +236,7 @@ def main():
     if arguments.json:
         print(json.dumps(result, indent=2))
         return
-    lines = []
-    for mode, rows in modes.items():
-        labelled = [(LABELS[name], row) for name, row in rows.items()]
-        labelled += [(f"Rust: {name}", row) for name, row in rust.get(mode, {}).items()]
-        lines += [*table(f"one step, {mode}", "microseconds", labelled, 1), ""]
-    million = [
-        (LABELS[name], {key: value / 1e6 for key, value in row.items()}) for name, row in batches.items()
-    ]
-    lines += [*table("batches", "million/s", million, 4), ""]
-    for ratio in result["ratios"]:
-        word = "met" if ratio["met"] else "NOT met"
-        lines.append(f"{ratio['what']:<60} {ratio['value']:8.2f}   {ratio['target']}: {word}")
-    lines += [f"not measured: {LABELS[name]}: {why}" for name, why in failures.items()]
-    print("\n".join(lines))
+    print("\n".join(report(result)))
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ STEP = [
     ("openenv websocket", "OpenEnv, WebSocket", THEIRS),
     ("dm_env_rpc", "dm_env_rpc", THEIRS),
     ("openenv http", "OpenEnv, HTTP", THEIRS),
+    ("remote-gym", "remote-gym", THEIRS),
 ]
 BATCH = [
     ("maze native 1024", "mazeway maze, remote, 1,024", OURS),

@@ -1,14 +1,17 @@
 """The peers of wire.py: servers that answer a step with what a tiny environment says, and loops that time a step.
 
 Run by wire.py, in its virtual environment: `python wire_peers.py serve NAME` prints the port and serves until its input
-ends; `python wire_peers.py measure` reads what to measure as JSON and prints the times. Every server steps the same toy, a
-walk over 16 numbers, so that what is timed is the way there and back.
+ends; `python wire_peers.py measure` reads what to measure as JSON and prints the times; `python wire_peers.py apart NAME`
+times for another process a peer whose requirements clash with the others'. Every server steps the same toy, a walk over 16
+numbers, so that what is timed is the way there and back.
 """
 
 import json
 import os
 import socket
+import subprocess
 import sys
+import tempfile
 import threading
 import time
 
@@ -165,15 +168,55 @@ def serve_openenv():
     raise RuntimeError("OpenEnv's server does not listen")
 
 
+REMOTE_GYM_TOY = """
+import gymnasium
+
+class Remote(gymnasium.Env):
+    observation_space = gymnasium.spaces.Discrete(16)
+    action_space = gymnasium.spaces.Discrete(4)
+    reward_range = (0.0, 1.0)
+    render_mode = None
+
+    def reset(self, **_):
+        self.state = 0
+        return 0, {}
+
+    def step(self, action):
+        self.state = (self.state + int(action)) % 16
+        return self.state, 0.0, False, False, {}
+
+def create_environment(**_):
+    return Remote()
+"""
+
+
+def serve_remote_gym():
+    """remote-gym's own server, which runs the environment in a process of its own, as it does by default."""
+    from remote_gym import create_remote_environment_server
+
+    place = tempfile.TemporaryDirectory()
+    os.chdir(place.name)
+    with open("toy.py", "w") as file:
+        file.write(REMOTE_GYM_TOY)
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    default = {"entrypoint": "toy.py", "entrypoint_kwargs": {}}
+    KEPT.append((place, create_remote_environment_server(default, "127.0.0.1", port)))
+    return port
+
+
 def serve(name):
     if name == "tcp":
         listener = socket.create_server(("127.0.0.1", 0))
         threading.Thread(target=serve_tcp, args=(listener,), daemon=True).start()
         where = listener.getsockname()[1]
     else:
-        where = {"grpc": serve_grpc, "dm_env_rpc": serve_dm_env_rpc, "openenv": serve_openenv}[name]()
+        servers = {"grpc": serve_grpc, "dm_env_rpc": serve_dm_env_rpc, "openenv": serve_openenv}
+        where = (servers | {"remote-gym": serve_remote_gym})[name]()
     print(where, flush=True)
     sys.stdin.read()
+    os._exit(0)  # a peer's children and threads may not want to end
 
 
 # Steps: each maker returns a callable that steps once, and how many steps one call is.
@@ -251,6 +294,37 @@ def step_openenv_http(ports):
     return lambda: session.post(f"{url}/step", json={"action": {"move": 1}}).json(), 1
 
 
+def step_remote_gym(port):
+    from remote_gym import RemoteEnvironment
+
+    env = RemoteEnvironment("127.0.0.1", port)
+    env.reset()
+    return lambda: env.step(1), 1
+
+
+class Apart:
+    """A step that another interpreter takes, and times."""
+
+    def __init__(self, python, name, port):
+        pipe = subprocess.PIPE
+        command = [python, __file__, "apart", name, str(port)]
+        self._process = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True)
+
+    def timed(self, calls):
+        print(calls, file=self._process.stdin, flush=True)
+        line = self._process.stdout.readline()
+        if not line:
+            raise RuntimeError(f"{self._process.args[3]}: its process ended")
+        return float(line)
+
+
+def time_apart(name, port):
+    """Steps as often as each line of the input says, and prints how long one took."""
+    step, _ = {"remote-gym": step_remote_gym}[name](port)
+    for line in sys.stdin:
+        print(timed(step, int(line)), flush=True)
+
+
 def step_mazeway(ports, client, wrapped=True, address=None):
     import gymnasium
     import mazeway
@@ -285,12 +359,16 @@ def step_local(wrapped):
     return lambda: env.step(1), 1
 
 
-def batch_mazeway(ports, name, num_envs, client):
+def batch_mazeway(ports, name, num_envs, client, **options):
     import gymnasium
     import numpy as np
 
     env = gymnasium.make_vec(
-        f"mazeway/{name}", num_envs=num_envs, address=f"127.0.0.1:{ports['mazeway']}", client=client
+        f"mazeway/{name}",
+        num_envs=num_envs,
+        address=f"127.0.0.1:{ports['mazeway']}",
+        client=client,
+        **options,
     )
     env.reset(seed=1)
     actions = np.random.default_rng(0).integers(env.single_action_space.n, size=(64, num_envs))
@@ -359,11 +437,16 @@ CASES = {
     "dm_env_rpc": lambda p: step_dm_env_rpc(p["dm_env_rpc"]),
     "openenv websocket": lambda p: step_openenv_websocket(p),
     "openenv http": lambda p: step_openenv_http(p),
+    "remote-gym": lambda p: (Apart(p["remote-gym python"], "remote-gym", p["remote-gym"]), 1),
     "maze native 64": lambda p: batch_mazeway(p, "Maze-v0", 64, "native"),
     "maze native 1024": lambda p: batch_mazeway(p, "Maze-v0", 1024, "native"),
     "maze native 16384": lambda p: batch_mazeway(p, "Maze-v0", 16384, "native"),
     "maze grpcio 1024": lambda p: batch_mazeway(p, "Maze-v0", 1024, "grpc"),
     "highway native 1024": lambda p: batch_mazeway(p, "Highway-v0", 1024, "native"),
+    # As many vehicles as highway-fast has, and an observation of the same kind.
+    "highway kinematics native 1024": lambda p: batch_mazeway(
+        p, "Highway-v0", 1024, "native", density=20 / 3, observation="kinematics"
+    ),
     "highway grpcio 1024": lambda p: batch_mazeway(p, "Highway-v0", 1024, "grpc"),
     "envpool frozenlake 1024": lambda _: batch_envpool("FrozenLake-v1", 1024),
     "envpool highway-fast 16": lambda _: batch_envpool("highway-fast-v0", 16),
@@ -377,6 +460,9 @@ CASES = {
 
 
 def timed(step, calls):
+    """Seconds of one call."""
+    if isinstance(step, Apart):
+        return step.timed(calls)
     begun = time.perf_counter()
     for _ in range(calls):
         step()
@@ -389,8 +475,7 @@ def measure(job):
     for name in job["cases"]:
         try:
             step, size = CASES[name](job["ports"])
-            for _ in range(3):
-                step()
+            timed(step, 3)
             # As many calls as fit into a round's share of time.
             calls = max(1, int(job["secs"] / max(timed(step, 2), 1e-7)))
             calls = max(1, int(job["secs"] / max(timed(step, max(2, calls // 10)), 1e-7)))
@@ -408,6 +493,9 @@ def measure(job):
 if __name__ == "__main__":
     if sys.argv[1] == "serve":
         serve(sys.argv[2])
+    elif sys.argv[1] == "apart":
+        time_apart(sys.argv[2], int(sys.argv[3]))
+        os._exit(0)
     else:
         print(json.dumps(measure(json.loads(sys.stdin.read()))), flush=True)
         os._exit(0)  # peers' threads may not want to end

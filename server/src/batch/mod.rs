@@ -133,17 +133,19 @@ pub trait Batch: Any + Send {
 
 /// A batch of simulators of one kind, what they are made of apart in arrays.
 pub struct SimBatch<S: Simulator> {
-    spec: Arc<EnvSpec>,
-    columns: Vec<InfoColumn>,
+    /// Shared by all batches of equal options.
+    configured: Arc<Configured<S>>,
+    /// The columns with the action mask, where that was asked for; otherwise they are those of the spec.
+    masked_columns: Option<Box<[InfoColumn]>>,
     options: BatchOptions,
     /// Bytes of each info column of the spec.
-    info_lens: Vec<usize>,
+    info_lens: Box<[usize]>,
     /// What all environments share, and the place where one is put together.
     scratch: S,
-    states: Vec<S::Stored>,
+    states: Box<[S::Stored]>,
     /// Without meaning until the first reset.
-    rngs: Vec<Rng>,
-    clocks: Vec<Clock>,
+    rngs: Box<[Rng]>,
+    clocks: Box<[Clock]>,
     buffers: StepBuffers,
     /// Set by the first reset, which covers every environment.
     born: bool,
@@ -153,24 +155,24 @@ pub struct SimBatch<S: Simulator> {
 
 impl<S: Simulator> SimBatch<S> {
     /// Allocates everything that the batch will ever need.
-    pub fn new(configured: &Configured<S>, options: BatchOptions) -> Self {
-        let spec = Arc::clone(&configured.spec);
-        let columns = buffers::info_columns(&spec, options.action_masks);
+    pub fn new(configured: impl Into<Arc<Configured<S>>>, options: BatchOptions) -> Self {
+        let configured = configured.into();
+        let columns = buffers::info_columns(&configured.spec, options.action_masks);
         assert!(columns.len() <= buffers::MAX_COLUMNS, "an environment of at most {} columns", buffers::MAX_COLUMNS);
-        let layout = Layout::new(&spec, &columns, options);
+        let layout = Layout::new(&configured.spec, &columns, options);
         Self {
-            info_lens: spec.info_columns.iter().map(InfoColumn::packed_len).collect(),
-            spec,
-            columns,
+            masked_columns: options.action_masks.then(|| columns.into()),
             options,
+            info_lens: configured.spec.info_columns.iter().map(InfoColumn::packed_len).collect(),
             scratch: configured.prototype.clone(),
-            states: vec![configured.prototype.stored(); options.num_envs],
-            rngs: vec![Rng::new(0, 0); options.num_envs],
-            clocks: vec![Clock::default(); options.num_envs],
+            states: vec![configured.prototype.stored(); options.num_envs].into(),
+            rngs: vec![Rng::new(0, 0); options.num_envs].into(),
+            clocks: vec![Clock::default(); options.num_envs].into(),
             buffers: StepBuffers::new(layout),
             born: false,
             steps: 0,
             resets: 0,
+            configured,
         }
     }
 
@@ -215,7 +217,7 @@ impl<S: Simulator> SimBatch<S> {
         if actions.len() != expected {
             return Err(BatchError::ActionsLength { expected, got: actions.len(), num_envs });
         }
-        let (actions, n_actions) = (actions.as_chunks::<4>().0, self.spec.n_actions);
+        let (actions, n_actions) = (actions.as_chunks::<4>().0, self.configured.spec.n_actions);
         let disabled = self.options.autoreset == Autoreset::Disabled;
         // As unsigned numbers negative actions are large: one comparison, many at a time.
         let right = actions.iter().fold(true, |right, action| right & (u32::from_le_bytes(*action) < n_actions));
@@ -267,11 +269,11 @@ impl<S: Simulator> SimBatch<S> {
 
 impl<S: Simulator> Batch for SimBatch<S> {
     fn spec(&self) -> &Arc<EnvSpec> {
-        &self.spec
+        &self.configured.spec
     }
 
     fn info_columns(&self) -> &[InfoColumn] {
-        &self.columns
+        self.masked_columns.as_deref().unwrap_or(&self.configured.spec.info_columns)
     }
 
     fn options(&self) -> BatchOptions {

@@ -99,7 +99,7 @@ fn options(num_envs: usize, autoreset: Autoreset, max_episode_steps: u32) -> Bat
 }
 
 fn batch(num_envs: usize, autoreset: Autoreset, max_episode_steps: u32) -> SimBatch<Chain> {
-    SimBatch::new(&chain(), options(num_envs, autoreset, max_episode_steps))
+    SimBatch::new(chain(), options(num_envs, autoreset, max_episode_steps))
 }
 
 fn pack(actions: &[i32]) -> Vec<u8> {
@@ -246,8 +246,8 @@ proptest! {
 #[test]
 fn the_time_limit_truncates_and_zero_never_does() {
     let maze = maze::configure(&serde_json::Map::new()).unwrap();
-    let mut limited = SimBatch::new(&maze, options(1, Autoreset::Disabled, 3));
-    let mut unlimited = SimBatch::new(&maze, options(1, Autoreset::Disabled, 0));
+    let mut limited = SimBatch::new(maze.clone(), options(1, Autoreset::Disabled, 3));
+    let mut unlimited = SimBatch::new(maze, options(1, Autoreset::Disabled, 0));
     limited.reset(Seeds::From(0), None).unwrap();
     unlimited.reset(Seeds::From(0), None).unwrap();
     let flags: Vec<_> = (0..3).map(|_| limited.step(&pack(&[0])).unwrap().truncated()[0]).collect();

@@ -62,7 +62,8 @@ impl Host {
             return Err(CallError::Limit { field: "num_envs", what, limit: limit as u64, asked: reply_bytes as u64 });
         }
         let now = Instant::now();
-        let (id, lease) = self.sessions.create(asked.num_envs, asked.lease, now, || environment.batch(options))?;
+        let (id, lease) =
+            self.sessions.create(asked.num_envs, asked.lease, now, || Arc::clone(&environment).batch(options))?;
         tracing::debug!(session = ?id, env_id = spec.env_id, num_envs = asked.num_envs, ?lease, "session created");
         Ok((self.sessions.take(id, now, None)?, lease))
     }

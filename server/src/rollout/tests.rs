@@ -144,7 +144,7 @@ fn a_session_that_repeats_the_actions_sees_the_same_episode() {
     let all = run(&plan(Controller::Driver("random".into())));
     let options =
         BatchOptions { num_envs: 23, autoreset: Autoreset::Disabled, max_episode_steps: 0, action_masks: false };
-    let mut batch = SimBatch::new(&maze(), options);
+    let mut batch = SimBatch::new(maze(), options);
     batch.reset(Seeds::From(40), None).unwrap();
     for step in 0..17 {
         let at = |episode: usize| episode * 17 + step;
@@ -195,7 +195,7 @@ fn an_episode_that_ends_in_burn_in_begins_anew() {
         BatchOptions { num_envs: 1, autoreset: Autoreset::SameStep, max_episode_steps: 0, action_masks: false };
     let (mut at, mut restarts) = (0, 0);
     for episode in 0..20 {
-        let mut batch = SimBatch::new(&highway, options);
+        let mut batch = SimBatch::new(highway.clone(), options);
         batch.reset(Seeds::From(40 + episode as u64), None).unwrap();
         for _ in 0..100 {
             restarts += u32::from(batch.step(&3_i32.to_le_bytes()).unwrap().terminated()[0]);

@@ -19,7 +19,7 @@ fn sessions() -> Arc<Sessions> {
 fn batch(num_envs: usize) -> Box<dyn Batch> {
     let maze = maze::configure(&serde_json::Map::new()).unwrap();
     let options = BatchOptions { num_envs, autoreset: Autoreset::NextStep, max_episode_steps: 0, action_masks: false };
-    Box::new(SimBatch::new(&maze, options))
+    Box::new(SimBatch::new(maze, options))
 }
 
 fn create(sessions: &Sessions, num_envs: usize, now: Instant) -> Result<SessionId, SessionError> {

@@ -26,6 +26,10 @@ impl Spread {
         Self { median: at(0.5), low: at(0.25), high: at(0.75) }
     }
 
+    pub fn median(self) -> f64 {
+        self.median
+    }
+
     /// The same as a rate of `units` in each of these times, µs.
     pub fn rate(self, units: u32) -> Self {
         let rate = |us: f64| f64::from(units) * 1e6 / us;
@@ -84,7 +88,8 @@ pub fn in_rounds(subjects: &mut [Subject], rounds: usize, slice: Duration) -> Ve
 /// All figures, as the object that `--json` writes.
 pub struct Report(Value);
 
-const LISTS: [&str; 7] = ["round_trips", "pipelined", "batches", "ratios", "memory", "scale", "watching"];
+const LISTS: [&str; 8] =
+    ["round_trips", "pipelined", "batches", "rollouts", "ratios", "memory", "scale", "watching"];
 
 /// What is promised of one figure over another.
 const LIMITS: [(&str, &str, Option<f64>); 6] = [
@@ -197,11 +202,13 @@ impl Report {
         table("pipelined", "Steps a second, sent ahead", &["mode", "name", "in_flight", "median", "low", "high"]);
         let batch = ["mode", "env", "num_envs", "name", "median", "low", "high"];
         table("batches", "Steps a second of a batch", &batch);
+        let rollout = ["mode", "env", "controller", "median", "low", "high", "promised", "met"];
+        table("rollouts", "Steps a second of a roll-out", &rollout);
         table("ratios", "Ratios", &["mode", "name", "value", "limit", "met"]);
         table("memory", "Memory of the server, bytes", &["name", "env", "count", "bytes", "limit", "met"]);
         let watching = ["mode", "env", "name", "median", "low", "high", "pictures"];
         table("watching", "Round trip of one step with and without viewers, µs", &watching);
-        table("scale", "Steps a second of many sessions together", &["sessions", "median", "low", "high"]);
+        table("scale", "Steps a second of many sessions together", &["sessions", "name", "median", "low", "high"]);
         out
     }
 }

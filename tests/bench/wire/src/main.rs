@@ -15,9 +15,10 @@
 //! | `round_trips` | `mode`, `name`, `median`, `low`, `high`: µs from a request to its answer, one maze |
 //! | `pipelined` | `mode`, `name`, `in_flight`, `median`, `low`, `high`: steps a second, one maze, sent ahead |
 //! | `batches` | `mode`, `env`, `num_envs`, `name`, `median`, `low`, `high`: environments' steps a second, batch after batch |
+//! | `rollouts` | `mode`, `env`, `controller`, `promised`, `met`, `median`, `low`, `high`: steps a second that reach the client |
 //! | `ratios` | `mode`, `name`, `value`, `limit` (null where none is promised), `met` |
-//! | `memory` | `name`, `env`, `count`, `bytes`, `limit`, `met`: resident bytes of the server for one of `name` |
-//! | `scale` | `sessions`, `median`, `low`, `high`: steps a second of all together, each with a stream of its own |
+//! | `memory` | `name`, `env`, `count`, `bytes`, `limit`, `met`: resident bytes of the server for one of `name`, see [`memory`] |
+//! | `scale` | `sessions`, `name`, `median`, `low`, `high`: steps a second of all together, each with a stream of its own |
 //! | `watching` | `mode`, `env`, `name`, `median`, `low`, `high`, `pictures`: µs from a step's request to its answer; pictures read |
 //!
 //! and beside them `benchmark` ("wire"), `cores`, `cpu`, `rounds`. Names in `round_trips`: `raw_tcp`, `raw_unix` (blocking
@@ -31,7 +32,9 @@ mod figures;
 mod memory;
 mod peers;
 mod process;
+mod rollouts;
 mod round_trips;
+mod scale;
 mod throughput;
 mod watching;
 
@@ -57,6 +60,7 @@ enum Part {
     RoundTrips,
     Pipelined,
     Batches,
+    Rollouts,
     Memory,
     Scale,
     Watching,
@@ -72,7 +76,11 @@ struct Cli {
     #[arg(long, value_delimiter = ',', default_value = "pinned,idle")]
     modes: Vec<Mode>,
     /// Which parts; memory and scale are measured in mode `idle`.
-    #[arg(long, value_delimiter = ',', default_value = "round_trips,pipelined,batches,memory,scale,watching")]
+    #[arg(
+        long,
+        value_delimiter = ',',
+        default_value = "round_trips,pipelined,batches,rollouts,memory,scale,watching"
+    )]
     parts: Vec<Part>,
     /// Rounds of every figure.
     #[arg(long, default_value_t = 9)]
@@ -171,8 +179,9 @@ fn measure(setting: &Setting, parts: &[Part]) -> Report {
             Part::RoundTrips => round_trips::measure(setting, &mut report),
             Part::Pipelined => throughput::pipelined(setting, &mut report),
             Part::Batches => throughput::batches(setting, &mut report),
+            Part::Rollouts => rollouts::measure(setting, &mut report),
             Part::Memory => memory::measure(setting, &mut report),
-            Part::Scale => memory::scale(setting, &mut report),
+            Part::Scale => scale::measure(setting, &mut report),
             Part::Watching => watching::measure(setting, &mut report),
         }
     }

@@ -1,18 +1,22 @@
-//! What the server takes: at rest, for a session, for its stream, for an environment of a batch; and many sessions at once.
+//! What the server takes: at rest, for a session, for its stream, for an environment of a batch.
+//!
+//! Names of the figures: `idle_server`; `session`, one environment each, `count` of them; `session_with_stream`, reset and
+//! stepped; `environment`, one more in a batch of `count`; `environment_and_share`, the whole batch by its environments,
+//! reset and stepped: what was allocated is in use.
 
 use crate::{
     Setting,
-    figures::{Report, Subject, in_rounds},
+    figures::Report,
     process::Process,
     round_trips::{current_thread, endless},
 };
-use mazeway_client::{Autoreset, Connection, Env, VectorEnv};
+use mazeway_client::{Connection, Env, channel};
+use mazeway_proto::env::{self as pb, environment_service_client::EnvironmentServiceClient};
 use serde_json::json;
-use std::sync::Arc;
-use tokio::sync::Mutex;
+use tokio::runtime::Runtime;
 
 /// Sessions of one connection.
-const SESSIONS_A_CONNECTION: usize = 1000;
+pub const SESSIONS_A_CONNECTION: usize = 1000;
 
 fn push(report: &mut Report, name: &str, env: Option<&str>, count: usize, bytes: f64, limit: Option<f64>) {
     let met = limit.map(|limit| bytes <= limit);
@@ -20,7 +24,7 @@ fn push(report: &mut Report, name: &str, env: Option<&str>, count: usize, bytes:
     report.push_plain("memory", record);
 }
 
-async fn sessions(address: &str, env_id: &str, count: usize) -> Vec<Env> {
+pub async fn sessions(address: &str, env_id: &str, count: usize) -> Vec<Env> {
     let mut envs = Vec::with_capacity(count);
     for _ in 0..count.div_ceil(SESSIONS_A_CONNECTION) {
         let connection = Connection::open(address).await.expect("connects");
@@ -61,60 +65,43 @@ pub fn measure(setting: &Setting, report: &mut Report) {
     }
     let sizes: &[u32] = if setting.quick { &[64] } else { &[64, 1024, 16_384, 65_536] };
     for (env_id, limit) in [("Maze-v0", 64.0), ("Highway-v0", 1024.0)] {
+        let single = batch_bytes(setting, &runtime, env_id, 1);
         for &num_envs in sizes {
-            let process = Process::server(setting, "127.0.0.1:0");
-            runtime.block_on(async {
-                let connection = Connection::open(process.address()).await.expect("connects");
-                let mut first = Env::create(&connection, env_id, endless()).await.expect("a session");
-                first.reset(Some(1)).await.expect("resets");
-                // Small batches are counted by the dozen, for memory comes in pages.
-                let batches = (65_536 / num_envs).max(1) as usize;
-                let before = process.resident();
-                let mut made = Vec::new();
-                for _ in 0..batches {
-                    let make = VectorEnv::create(&connection, env_id, num_envs, Autoreset::NextStep, endless());
-                    made.push(make.await.expect("a session"));
-                }
-                let per_env = (process.resident() - before) / (batches * num_envs as usize) as f64;
-                push(report, "environment", Some(env_id), num_envs as usize, per_env, Some(limit));
-                std::mem::forget((first, made));
-            });
+            let (bytes, envs) = (batch_bytes(setting, &runtime, env_id, num_envs), f64::from(num_envs));
+            let (more, count) = ((bytes - single) / (envs - 1.0), num_envs as usize);
+            push(report, "environment", Some(env_id), count, more, Some(limit));
+            push(report, "environment_and_share", Some(env_id), count, bytes / envs, None);
         }
     }
 }
 
-pub fn scale(setting: &Setting, report: &mut Report) {
-    let counts: &[usize] = if setting.quick { &[1, 10] } else { &[1, 10, 100, 1000, 10_000] };
-    for &count in counts {
-        let (process, runtime) = (Process::server(setting, "127.0.0.1:0"), current_thread());
-        let envs = runtime.block_on(async {
-            let mut envs = sessions(process.address(), "Maze-v0", count).await;
-            for env in &mut envs {
-                env.reset(Some(1)).await.expect("resets");
-            }
-            envs.into_iter().map(|env| Arc::new(Mutex::new(env))).collect::<Vec<_>>()
-        });
-        let mut subject = [Subject::new("sessions", |times| {
-            runtime.block_on(async {
-                let mut tasks = tokio::task::JoinSet::new();
-                for env in &envs {
-                    let env = Arc::clone(env);
-                    tasks.spawn(async move {
-                        let mut env = env.lock().await;
-                        for i in 0..times {
-                            env.step((i % 4) as u32).await.expect("steps");
-                        }
-                    });
-                }
-                while let Some(outcome) = tasks.join_next().await {
-                    outcome.expect("a task that ends well");
-                }
-            });
-        })];
-        let slice = setting.slice * 5;
-        let spread = in_rounds(&mut subject, setting.rounds.min(5), slice).remove(0).rate(count as u32);
-        report.push("scale", json!({"sessions": count}), spread);
-        drop(subject);
-        std::mem::forget(envs);
-    }
+/// Bytes of a session with `num_envs` environments that was reset and stepped, without a stream.
+fn batch_bytes(setting: &Setting, runtime: &Runtime, env_id: &str, num_envs: u32) -> f64 {
+    let process = Process::server(setting, "127.0.0.1:0");
+    // Small batches are counted by the dozen, for memory comes in pages.
+    let batches = (65_536 / num_envs).clamp(1, 2000);
+    runtime.block_on(async {
+        let channel = channel(process.address()).await.expect("connects");
+        let mut service = EnvironmentServiceClient::new(channel).max_decoding_message_size(64 << 20);
+        let make = pb::CreateSessionRequest {
+            env_id: env_id.into(),
+            num_envs,
+            max_episode_steps: Some(0),
+            ..Default::default()
+        };
+        let mut batch = async || {
+            let session_id = service.create_session(make.clone()).await.expect("a session").into_inner().session_id;
+            let reset = pb::ResetRequest { session_id: session_id.clone(), seed: Some(1), ..Default::default() };
+            service.reset(reset).await.expect("resets");
+            let step = pb::StepRequest { session_id, actions: vec![0; 4 * num_envs as usize].into() };
+            service.step(step).await.expect("steps");
+        };
+        // What the first allocates for all is no session's.
+        batch().await;
+        let before = process.resident();
+        for _ in 0..batches {
+            batch().await;
+        }
+        (process.resident() - before) / f64::from(batches)
+    })
 }

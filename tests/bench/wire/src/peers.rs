@@ -23,6 +23,8 @@ use tonic::{
 /// Bytes in flight: enough for the largest batch.
 const WINDOW_BYTES: u32 = 64 << 20;
 const MAX_MESSAGE_BYTES: usize = 64 << 20;
+/// Streams of a connection at a time.
+const MAX_STREAMS: u32 = 20_000;
 /// Header with the size of the replies that a caller wants.
 const REPLY_BYTES: &str = "reply-bytes";
 
@@ -98,7 +100,8 @@ pub fn serve() {
 }
 
 fn server() -> Server {
-    Server::builder().initial_stream_window_size(WINDOW_BYTES).initial_connection_window_size(WINDOW_BYTES)
+    let server = Server::builder().max_concurrent_streams(MAX_STREAMS);
+    server.initial_stream_window_size(WINDOW_BYTES).initial_connection_window_size(WINDOW_BYTES)
 }
 
 /// A plain socket that asks and waits.
@@ -227,6 +230,7 @@ impl Service<http::Request<Body>> for Echo {
 }
 
 /// A bare client of [`Echo`].
+#[derive(Clone)]
 pub struct Tonic {
     grpc: tonic::client::Grpc<Channel>,
     request: Bytes,

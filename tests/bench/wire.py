@@ -46,8 +46,8 @@ PACKAGES = [
     "numpy==2.4.6",
     "openenv-core==0.3.0",
 ]
-# Wants an older protobuf than the others: it gets a virtual environment of its own.
-APART = {"remote-gym": ["remote-gym==0.7.3"]}
+# Wants an older protobuf than the others: it gets a virtual environment of its own, with the last dm_env_rpc that runs on it.
+APART = {"remote-gym": ["dm-env-rpc==1.1.6", "remote-gym==0.7.3"]}
 ROUND_TRIPS = [
     "tcp",
     "gymnasium",
@@ -128,7 +128,10 @@ class Servers:
             self.ports[name] = int(self._start([*pin, python, str(PEERS), "serve", name]))
         for name, own in apart.items():
             self.ports[f"{name} python"] = own
-            self.ports[name] = int(self._start([*pin, own, str(PEERS), "serve", name]))
+            try:
+                self.ports[name] = int(self._start([*pin, own, str(PEERS), "serve", name]))
+            except RuntimeError as error:
+                log(error)  # the case that asks for it will say so
 
     def _start(self, command):
         pipe = subprocess.PIPE

@@ -170,11 +170,12 @@ def serve_openenv():
 
 REMOTE_GYM_TOY = """
 import gymnasium
+import numpy
 
 class Remote(gymnasium.Env):
     observation_space = gymnasium.spaces.Discrete(16)
     action_space = gymnasium.spaces.Discrete(4)
-    reward_range = (0.0, 1.0)
+    reward_range = (numpy.float32(0), numpy.float32(1))
     render_mode = None
 
     def reset(self, **_):
@@ -202,7 +203,7 @@ def serve_remote_gym():
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     default = {"entrypoint": "toy.py", "entrypoint_kwargs": {}}
-    KEPT.append((place, create_remote_environment_server(default, "127.0.0.1", port)))
+    KEPT.append((place, create_remote_environment_server(default, "127.0.0.1", port, use_thread=True)))
     return port
 
 

@@ -4,17 +4,18 @@
 
 Makes a virtual environment of its own (kept in the cache directory, `--venv`), installs the peers from PyPI in pinned
 versions and the Python client from `clients/python` with its native module, builds the environment server in release mode
-(or takes `--binary`), and measures: the time of one step, there and back, pinned to one core (`taskset`) and on all of them;
-and steps a second of batches. The cases of a mode are timed in one process, in turns, round by round: what disturbs the
-machine disturbs them all. Medians over the rounds, with the lowest and the highest beside them.
+(or takes `--binary`), and measures the time of one step, there and back, and steps a second of batches: in mode `pinned`
+everything on one core (`taskset`), in mode `idle` on all of them. The cases of a mode are timed in one process, in turns,
+round by round: what disturbs the machine disturbs them all. Medians over the rounds, with the lowest and the highest beside
+them.
 
 Peers: a bare TCP ping-pong in Python (the floor); Gymnasium's own wrappers around an environment that does nothing; bare
 echoes by grpcio; dm_env_rpc's, OpenEnv's and remote-gym's own servers and clients around a toy; EnvPool's FrozenLake and highway-fast,
 Gymnasium's vector environments and highway-env in process. Rust's own figures, the floor of blocking sockets in Rust, the
 roll-outs and the memory of the server are those of `cargo run --release -p mazeway-bench-wire`, run after the others.
 
-`--json` prints one object: `round_trip_microseconds` (by mode and case) and `steps_per_second` (by case), each figure with
-`median`, `low` and `high`; `rust`, the object of the Rust benchmark; `targets`, a list of `what`, `target`, `measured`,
+`--json` prints one object: `round_trip_microseconds` and `steps_per_second`, both by mode and case, each figure
+with `median`, `low` and `high`; `rust`, the object of the Rust benchmark; `targets`, a list of `what`, `target`, `measured`,
 `met`; `failures`, the cases that did not run and why; `rounds`, `cores`, `cpu`.
 
 FrozenLake (16 states) is compared with the maze (57 states), highway-fast (continuous kinematics, 3 lanes, fewer vehicles
@@ -57,6 +58,7 @@ ROUND_TRIPS = [
     "native unix",
     "grpcio",
     "grpcio unwrapped",
+    "grpcio tonic echo bidi",
     "grpcio echo bidi",
     "grpcio echo unary",
     "dm_env_rpc",
@@ -110,8 +112,9 @@ def prepare(directory):
 
 
 def build_server():
-    log("building the server")
-    subprocess.run(["cargo", "build", "--release", "-q", "--bin", "server"], cwd=REPOSITORY, check=True)
+    log("building the server and the Rust benchmark")
+    command = ["cargo", "build", "--release", "-q", "--bin", "server", "--bin", "wire"]
+    subprocess.run(command, cwd=REPOSITORY, check=True)
     return str(Path(os.environ.get("CARGO_TARGET_DIR", REPOSITORY / "target")) / "release" / "server")
 
 
@@ -126,6 +129,10 @@ class Servers:
         self._start([*pin, binary, "--listen", f"unix:{self.ports['mazeway unix']}"])
         for name in ("tcp", "grpc", "dm_env_rpc", "openenv"):
             self.ports[name] = int(self._start([*pin, python, str(PEERS), "serve", name]))
+        echo = Path(binary).resolve().with_name("wire")
+        if echo.is_file():
+            command = [*pin, str(echo), "--serve-peers"]
+            self.ports["tonic"] = self._start(command, cwd=self.place.name).split()[-2]
         for name, own in apart.items():
             self.ports[f"{name} python"] = own
             try:
@@ -133,14 +140,16 @@ class Servers:
             except RuntimeError as error:
                 log(error)  # the case that asks for it will say so
 
-    def _start(self, command):
+    def _start(self, command, cwd=None):
         pipe = subprocess.PIPE
-        process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, text=True)
+        process = subprocess.Popen(
+            command, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, text=True, cwd=cwd
+        )
         self.processes.append(process)
         line = process.stdout.readline()
         if not line:
             raise RuntimeError(f"{command}: no word of where it listens")
-        return line.split()[-1]
+        return line.strip()
 
     def stop(self):
         for process in self.processes:
@@ -164,13 +173,14 @@ def run(python, apart, binary, cases, rounds, secs, pin):
         servers.stop()
 
 
-def rust_figures(binary, rounds):
+def rust_figures(binary, modes, rounds):
     """What the Rust benchmark measures that has a target, as its own object; empty where it is not there."""
     if not (REPOSITORY / "tests" / "bench" / "wire" / "Cargo.toml").is_file():
         return {}
     log("measuring the Rust client, roll-outs and memory")
     command = ["cargo", "run", "-q", "--release", "-p", "mazeway-bench-wire", "--", "--json", "-"]
-    command += ["--parts", "round_trips,rollouts,memory", "--rounds", str(rounds), "--server", binary]
+    command += ["--parts", "round_trips,rollouts,memory", "--modes", modes]
+    command += ["--rounds", str(rounds), "--server", binary]
     done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False)
     if done.returncode:
         log(f"the Rust benchmark failed: {done.stderr.strip()[-300:]}")
@@ -188,9 +198,13 @@ def main():
     )
     parser.add_argument("--rounds", type=int, default=9, help="times that each case is measured")
     parser.add_argument("--secs", type=float, default=0.1, help="length of one measurement")
-    parser.add_argument("--binary", help="the environment server; built in release mode if not given")
+    parser.add_argument(
+        "--binary",
+        help="the environment server, the Rust benchmark beside it; built in release mode if not given",
+    )
     parser.add_argument("--venv", type=Path, default=Path.home() / ".cache" / "mazeway-bench" / "wire")
     parser.add_argument("--python", help="an interpreter that has the peers and the client already")
+    parser.add_argument("--modes", default="pinned,idle", help="which modes, of these")
     parser.add_argument("--skip", default="", help="cases to leave out, by the beginnings of their names")
     parser.add_argument("--no-rust", action="store_true", help="leave the Rust benchmark out")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
@@ -209,24 +223,31 @@ def main():
     def chosen(cases):
         return [name for name in cases if name not in failures and not (skipped and name.startswith(skipped))]
 
-    modes = {}
+    trips, batches = {}, {}
     for mode, pin in (("pinned", ["taskset", "-c", "0"]), ("idle", [])):
-        log(f"measuring round trips, {mode}")
-        said = run(python, apart, binary, chosen(ROUND_TRIPS), arguments.rounds, arguments.secs, pin)
-        modes[mode] = {name: summary(times) for name, times in said["microseconds"].items()}
+        if mode not in arguments.modes.split(","):
+            continue
+        log(f"measuring, {mode}")
+        cases = chosen(ROUND_TRIPS) + chosen(BATCHES)
+        said = run(python, apart, binary, cases, arguments.rounds, arguments.secs, pin)
         failures |= said["failures"]
-    log("measuring batches")
-    said = run(python, apart, binary, chosen(BATCHES), arguments.rounds, arguments.secs, [])
-    failures |= said["failures"]
-    batches = {}
-    for name, times in said["microseconds"].items():
-        batches[name] = summary([said["sizes"][name] / time * 1e6 for time in times])
-    rust = {} if arguments.no_rust else rust_figures(str(Path(binary).resolve()), arguments.rounds)
+        times, sizes = said["microseconds"], said["sizes"]
+        trips[mode] = {name: summary(times[name]) for name in ROUND_TRIPS if name in times}
+        batches[mode] = {
+            name: summary([sizes[name] / time * 1e6 for time in times[name]])
+            for name in BATCHES
+            if name in times
+        }
+    rust = (
+        {}
+        if arguments.no_rust
+        else rust_figures(str(Path(binary).resolve()), arguments.modes, arguments.rounds)
+    )
     result = {
-        "round_trip_microseconds": modes,
+        "round_trip_microseconds": trips,
         "steps_per_second": batches,
         "rust": rust,
-        "targets": targets(modes, batches, rust),
+        "targets": targets(trips, batches, rust),
         "failures": failures,
         "rounds": arguments.rounds,
         "cores": os.cpu_count(),

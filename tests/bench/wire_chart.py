@@ -56,5 +56,6 @@ def draw(result, path):
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 3.6), layout="constrained")
     pinned = result["round_trip_microseconds"]["pinned"]
     bars(left, STEP, pinned, "one env.step from Python, microseconds, one core", 4)
-    bars(right, BATCH, result["steps_per_second"], f"steps a second, {result['cores']} cores", 30)
+    batches = result["steps_per_second"]["idle"]
+    bars(right, BATCH, batches, f"steps a second, {result['cores']} cores", 30)
     figure.savefig(path, metadata={"Date": None} if path.endswith("svg") else None, dpi=150)

@@ -192,7 +192,7 @@ def create_environment(**_):
 
 
 def serve_remote_gym():
-    """remote-gym's own server, which runs the environment in a process of its own, as it does by default."""
+    """remote-gym's own server, the environment in a thread, which is the quicker of its two ways."""
     from remote_gym import create_remote_environment_server
 
     place = tempfile.TemporaryDirectory()
@@ -245,12 +245,26 @@ def step_grpc(ports, streaming):
         return lambda: once(b"x" * 32), 1
     requests = SimpleQueue()
     answers = channel.stream_stream("/Echo/Stream")(iter(requests.get, None))
+    return step_stream(requests, answers), 1
 
+
+def step_tonic(ports):
+    """grpcio's client of a bare stream that tonic serves: the Rust benchmark's echo."""
+    from queue import SimpleQueue
+
+    import grpc
+
+    requests = SimpleQueue()
+    stream = grpc.insecure_channel(ports["tonic"]).stream_stream("/bench.Echo/Bidi")
+    return step_stream(requests, stream(iter(requests.get, None), metadata=(("reply-bytes", "32"),))), 1
+
+
+def step_stream(requests, answers):
     def step():
         requests.put(b"x" * 32)
         next(answers)
 
-    return step, 1
+    return step
 
 
 def step_dm_env_rpc(port, num_envs=1, world=None):
@@ -362,6 +376,7 @@ def step_local(wrapped):
 
 def batch_mazeway(ports, name, num_envs, client, **options):
     import gymnasium
+    import mazeway  # noqa: F401 - registers its environments
     import numpy as np
 
     env = gymnasium.make_vec(
@@ -434,6 +449,7 @@ CASES = {
     "grpcio": lambda p: step_mazeway(p, "grpc"),
     "grpcio unwrapped": lambda p: step_mazeway(p, "grpc", wrapped=False),
     "grpcio echo bidi": lambda p: step_grpc(p, streaming=True),
+    "grpcio tonic echo bidi": lambda p: step_tonic(p),
     "grpcio echo unary": lambda p: step_grpc(p, streaming=False),
     "dm_env_rpc": lambda p: step_dm_env_rpc(p["dm_env_rpc"]),
     "openenv websocket": lambda p: step_openenv_websocket(p),

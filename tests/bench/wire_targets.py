@@ -9,8 +9,9 @@ LABELS = {
     "native unix": "mazeway, native, Unix socket",
     "grpcio": "mazeway, grpcio, gymnasium.make",
     "grpcio unwrapped": "mazeway, grpcio, without wrappers",
-    "grpcio echo bidi": "grpcio bidi echo, bare",
-    "grpcio echo unary": "grpcio unary echo, bare",
+    "grpcio tonic echo bidi": "grpcio bidi, bare, against a tonic echo",
+    "grpcio echo bidi": "grpcio bidi, bare, against a grpcio echo",
+    "grpcio echo unary": "grpcio unary, bare, against a grpcio echo",
     "dm_env_rpc": "dm_env_rpc's own server and client",
     "openenv websocket": "OpenEnv, WebSocket",
     "openenv http": "OpenEnv, HTTP",
@@ -49,14 +50,14 @@ def targets(modes, batches, rust):
         target = f"{bound} {wanted:g}{unit}"
         found.append({"what": what, "target": target, "measured": measured, "met": met})
 
+    def over(name, other, figures):
+        return lambda: figures[name] / figures[other]
+
     trips = {}
     for row in rust.get("round_trips", []):
         trips.setdefault(row["mode"], {})[row["name"]] = row["median"]
     for mode, rows in modes.items():
         at, ours = {name: row["median"] for name, row in rows.items()}, trips.get(mode, {})
-
-        def over(name, other, figures):
-            return lambda: figures[name] / figures[other]
 
         def unwrapped(floor, at=at):
             return lambda: (at["native"] - at["gymnasium.make"] + at["gymnasium"]) / floor()
@@ -75,17 +76,22 @@ def targets(modes, batches, rust):
         add(f"{mode}: dm_env_rpc / native step", over("dm_env_rpc", "native", at), "at least", 15, "x")
         openenv = min((name for name in at if name.startswith("openenv")), key=at.get, default="openenv")
         add(f"{mode}: OpenEnv's best / native step", over(openenv, "native", at), "at least", 8, "x")
-        grpcio = over("grpcio unwrapped", "grpcio echo bidi", at)
-        add(f"{mode}: grpcio step / bare grpcio echo", grpcio, "at most", 1.15, "x")
-    at = {name: row["median"] for name, row in batches.items()}
-    maze, highway = (lambda: at["maze native 1024"]), (lambda: at["highway native 1024"])
-    add("maze, 1,024: million steps a second", lambda: maze() / 1e6, "at least", 10)
-    add("maze / EnvPool's FrozenLake", lambda: maze() / at["envpool frozenlake 1024"], "at least", 10, "x")
-    add("highway, 1,024: million steps a second", lambda: highway() / 1e6, "at least", 1)
-    fast = max(
-        (name for name in at if name.startswith("envpool highway-fast")), key=at.get, default="envpool"
-    )
-    add("highway / EnvPool's best highway-fast", lambda: highway() / at[fast], "at least", 40, "x")
+        for echo in ("grpcio tonic echo bidi", "grpcio echo bidi"):
+            what = f"{mode}: grpcio step / {LABELS[echo]}"
+            add(what, over("grpcio unwrapped", echo, at), "at most", 1.15, "x")
+    for mode, rows in batches.items():
+        at = {name: row["median"] for name, row in rows.items()}
+        fast = max(
+            (name for name in at if name.startswith("envpool highway-fast")), key=at.get, default="envpool"
+        )
+        for name, least, peer, times in (
+            ("maze native 1024", 10, "envpool frozenlake 1024", 10),
+            ("highway native 1024", 1, fast, 40),
+        ):
+            what = f"{mode}: {LABELS[name]}"
+            add(f"{what}: million steps a second", lambda at=at, name=name: at[name] / 1e6, "at least", least)
+            if peer in at:
+                add(f"{what} / {LABELS[peer]}", over(name, peer, at), "at least", times, "x")
     for row in rust.get("rollouts", []):
         what = f"{row['mode']}: roll-out, {row['env']}, {row['controller']}: million steps a second"
         add(what, lambda row=row: row["median"] / 1e6, "at least", row["promised"] / 1e6)
@@ -115,11 +121,11 @@ def report(result):
         trips = [row for row in rust.get("round_trips", []) if row["mode"] == mode]
         labelled += [(f"Rust: {row['name']}, quartiles", row) for row in trips]
         lines += [*table(f"one step, {mode}", "microseconds", labelled, 1), ""]
-    million = [
-        (LABELS[name], {key: value / 1e6 for key, value in row.items()})
-        for name, row in result["steps_per_second"].items()
-    ]
-    lines += [*table("batches", "million/s", million, 5), ""]
+    for mode, rows in result["steps_per_second"].items():
+        million = [
+            (LABELS[name], {key: value / 1e6 for key, value in row.items()}) for name, row in rows.items()
+        ]
+        lines += [*table(f"batches, {mode}", "million/s", million, 5), ""]
     width = max([6, *(len(row["what"]) for row in result["targets"])])
     lines.append(f"{'target':<{width}}  {'':<18} {'measured':>10}")
     for row in result["targets"]:

@@ -154,6 +154,10 @@ class MessageLink:
         self._shape = tuple(space.shape or ())
         self._num_envs = created.num_envs
         self._columns = [_arrays.Column.from_wire(column) for column in spec.info_columns]
+        #: Names and readers, for a session of one environment.
+        self._singles = [(column.name, column.single()) for column in self._columns]
+        self._state = _arrays.number(self._dtype, "observations")
+        self._reward = _arrays.number(_arrays.FLOAT64, "rewards")
 
     def reset(
         self, seed: int | None, seeds: Sequence[int] | None, mask: npt.NDArray[np.bool_] | None
@@ -223,7 +227,7 @@ class MessageLink:
         response = self._ask(request).step
         return (
             self._observation(response.observations),
-            float(np.frombuffer(response.rewards, _arrays.FLOAT64)[0]),
+            self._reward(response.rewards),
             response.terminated != b"\0",
             response.truncated != b"\0",
             self._info(response.infos),
@@ -296,11 +300,12 @@ class MessageLink:
         return array.astype(np.int64) if self._discrete else array
 
     def _observation(self, data: bytes) -> Any:
-        array = _arrays.unpack(data, self._dtype, self._shape, "observations")
-        return np.int64(array[()]) if self._discrete else array
+        if self._discrete:
+            return np.int64(self._state(data))
+        return _arrays.unpack(data, self._dtype, self._shape, "observations")
 
     def _info(self, infos: Any) -> dict[str, Any]:
-        return {column.name: column.single(data) for column, data in zip(self._columns, infos, strict=True)}
+        return {name: read(data) for (name, read), data in zip(self._singles, infos, strict=True)}
 
 
 def link(transport: Transport, created: Any, timeout: float) -> Link:

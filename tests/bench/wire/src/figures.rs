@@ -88,8 +88,7 @@ pub fn in_rounds(subjects: &mut [Subject], rounds: usize, slice: Duration) -> Ve
 /// All figures, as the object that `--json` writes.
 pub struct Report(Value);
 
-const LISTS: [&str; 8] =
-    ["round_trips", "pipelined", "batches", "rollouts", "ratios", "memory", "scale", "watching"];
+const LISTS: [&str; 8] = ["round_trips", "pipelined", "batches", "rollouts", "ratios", "memory", "scale", "watching"];
 
 /// What is promised of one figure over another.
 const LIMITS: [(&str, &str, Option<f64>); 6] = [

@@ -76,11 +76,7 @@ struct Cli {
     #[arg(long, value_delimiter = ',', default_value = "pinned,idle")]
     modes: Vec<Mode>,
     /// Which parts; memory and scale are measured in mode `idle`.
-    #[arg(
-        long,
-        value_delimiter = ',',
-        default_value = "round_trips,pipelined,batches,rollouts,memory,scale,watching"
-    )]
+    #[arg(long, value_delimiter = ',', default_value = "round_trips,pipelined,batches,rollouts,memory,scale,watching")]
     parts: Vec<Part>,
     /// Rounds of every figure.
     #[arg(long, default_value_t = 9)]

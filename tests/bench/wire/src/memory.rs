@@ -79,7 +79,7 @@ pub fn measure(setting: &Setting, report: &mut Report) {
 fn batch_bytes(setting: &Setting, runtime: &Runtime, env_id: &str, num_envs: u32) -> f64 {
     let process = Process::server(setting, "127.0.0.1:0");
     // Small batches are counted by the dozen, for memory comes in pages.
-    let batches = (65_536 / num_envs).clamp(1, 2000);
+    let batches = (262_144 / num_envs).clamp(4, 2000);
     runtime.block_on(async {
         let channel = channel(process.address()).await.expect("connects");
         let mut service = EnvironmentServiceClient::new(channel).max_decoding_message_size(64 << 20);

@@ -335,7 +335,7 @@ class Apart:
 
 def time_apart(name, port):
     """Steps as often as each line of the input says, and prints how long one took."""
-    step, _ = {"remote-gym": step_remote_gym}[name](port)
+    step, _ = APART[name](port)
     for line in sys.stdin:
         print(timed(step, int(line)), flush=True)
 
@@ -471,8 +471,16 @@ CASES = {
     "dm_env_rpc 1024": lambda p: step_dm_env_rpc(p["dm_env_rpc"], 1024),
     "gymnasium one": lambda _: batch_gymnasium("one", 1),
     "gymnasium sync 64": lambda _: batch_gymnasium("sync", 64),
-    "gymnasium async 64": lambda _: batch_gymnasium("async", 64),
+    # It forks, which a process with gRPC's threads should not.
+    "gymnasium async 64": lambda _: (Apart(sys.executable, "gymnasium async 64", 0), 64),
     "highway-env one": lambda _: step_highway_env(),
+}
+
+
+#: What `time_apart` times.
+APART = {
+    "remote-gym": step_remote_gym,
+    "gymnasium async 64": lambda _: batch_gymnasium("async", 64),
 }
 
 

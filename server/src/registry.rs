@@ -10,6 +10,7 @@ use crate::{
     sim::{Configured, EnvSpec, OptionError, Simulator, TabularModel, highway, maze, options::shortened},
 };
 use serde_json::{Map, Value};
+use sha2::{Digest as _, Sha256};
 use std::{
     collections::HashMap,
     fmt,
@@ -191,9 +192,9 @@ fn canonical_options(given: &Options) -> impl Iterator<Item = (String, Value)> {
     given.iter().map(|(name, value)| (name.clone(), canonical(value)))
 }
 
-/// The id and the options that were given: equal for configurations asked for alike.
-fn given_key(env_id: &str, given: &Options) -> String {
-    format!("{env_id} {}", Value::Object(canonical_options(given).collect()))
+/// Digest of the id and the options that were given: equal for configurations asked for alike, and short however long they are.
+fn given_key(env_id: &str, given: &Options) -> Key {
+    Sha256::digest(format!("{env_id} {}", Value::Object(canonical_options(given).collect()))).into()
 }
 
 /// The id and every option, given or default: equal for equal configurations.
@@ -203,23 +204,25 @@ fn cache_key(spec: &EnvSpec, given: &Options) -> String {
     format!("{} {}", spec.env_id, Value::Object(options))
 }
 
+type Key = [u8; 32];
+
 /// Environments that somebody keeps, by what was asked for; bounded by the number of those who keep them.
 #[derive(Default)]
 struct InUse(Mutex<Kept>);
 
 #[derive(Default)]
 struct Kept {
-    environments: HashMap<String, Weak<dyn Environment>>,
+    environments: HashMap<Key, Weak<dyn Environment>>,
     sweep_at: usize,
 }
 
 impl InUse {
-    fn get(&self, key: &str) -> Option<Arc<dyn Environment>> {
+    fn get(&self, key: &Key) -> Option<Arc<dyn Environment>> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner).environments.get(key)?.upgrade()
     }
 
     /// Keeps `made`, unless another was quicker: then it gives back that one.
-    fn insert(&self, key: String, made: Arc<dyn Environment>) -> Arc<dyn Environment> {
+    fn insert(&self, key: Key, made: Arc<dyn Environment>) -> Arc<dyn Environment> {
         let mut kept = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(other) = kept.environments.get(&key).and_then(Weak::upgrade) {
             return other;

@@ -5,7 +5,7 @@ use crate::{
     errors::Failure,
 };
 use bytes::{Buf as _, BufMut as _, Bytes};
-use mazeway_client::Connection;
+use mazeway_client::{ClientCertificate, ConnectOptions, Connection, Token, Wire};
 use pyo3::{exceptions::PyValueError, prelude::*, types::PyBytes};
 use std::{
     mem,
@@ -22,7 +22,6 @@ use tonic::{
     client::Grpc,
     codec::{Codec, DecodeBuf, Decoder, EncodeBuf, Encoder},
     codegen::http::uri::PathAndQuery,
-    transport::Channel as Transport,
 };
 
 /// Largest message either way.
@@ -77,22 +76,23 @@ pub struct Link {
 #[derive(Debug)]
 pub struct Dial {
     address: String,
-    transport: OnceCell<Transport>,
+    options: ConnectOptions,
+    wire: OnceCell<Wire>,
 }
 
 impl Dial {
     /// The connection, opened with its first use.
-    async fn transport(&self) -> Result<Transport, Failure> {
-        Ok(self.transport.get_or_try_init(|| mazeway_client::channel(&self.address)).await?.clone())
+    async fn wire(&self) -> Result<Wire, Failure> {
+        Ok(self.wire.get_or_try_init(|| Wire::open(&self.address, &self.options)).await?.clone())
     }
 
     /// The same for the typed client.
     pub async fn connection(&self) -> Result<Connection, Failure> {
-        Ok(Connection::from_channel(self.transport().await?))
+        Ok(Connection::from_channel(self.wire().await?))
     }
 
-    async fn grpc(&self) -> Result<Grpc<Transport>, Failure> {
-        let mut grpc = Grpc::new(self.transport().await?)
+    async fn grpc(&self) -> Result<Grpc<Wire>, Failure> {
+        let mut grpc = Grpc::new(self.wire().await?)
             .max_decoding_message_size(MAX_MESSAGE_BYTES)
             .max_encoding_message_size(MAX_MESSAGE_BYTES);
         grpc.ready().await.map_err(|error| Failure::from(Status::from_error(error.into())))?;
@@ -124,11 +124,31 @@ impl Channel {
 
 #[pymethods]
 impl Channel {
+    /// Takes the token, and the contents of files in PEM: authorities, and a certificate with its key. Whether they go with
+    /// the address Python has seen to, which also waits no longer than its timeouts.
     #[new]
-    fn new(address: String, keeper: &Keeper) -> PyResult<Self> {
+    #[pyo3(signature = (address, keeper, token=None, ca=None, cert=None, key=None))]
+    fn new(
+        address: String,
+        keeper: &Keeper,
+        token: Option<&str>,
+        ca: Option<Vec<u8>>,
+        cert: Option<Vec<u8>>,
+        key: Option<Vec<u8>>,
+    ) -> PyResult<Self> {
+        let options = ConnectOptions {
+            token: token.map(Token::new).transpose().map_err(Failure::from)?,
+            ca,
+            certificate: cert.zip(key).map(|(chain, key)| ClientCertificate { chain, key }),
+            insecure: true,
+            deadline: Duration::MAX,
+            work_deadline: Duration::MAX,
+            ..ConnectOptions::default()
+        };
         let driver = Arc::new(Driver::new()?);
         keeper.watch(&driver)?;
-        Ok(Self(Local::new(Arc::new(Link { driver, dial: Arc::new(Dial { address, transport: OnceCell::new() }) }))))
+        let dial = Arc::new(Dial { address, options, wire: OnceCell::new() });
+        Ok(Self(Local::new(Arc::new(Link { driver, dial }))))
     }
 
     /// One request, one answer.

@@ -30,6 +30,8 @@ const SIGNALS: Duration = Duration::from_millis(100);
 const ROUND: Duration = Duration::from_secs(2);
 /// Silence after which it looks into a connection.
 const SILENCE: Duration = Duration::from_secs(1);
+/// Silence after which something may have happened that a step should know.
+const ASIDE: Duration = Duration::from_millis(20);
 /// Times that a connection's tasks are run to take in and send out what is there.
 const TURNS: usize = 8;
 /// Longest wait: beyond it nobody can tell.
@@ -114,6 +116,14 @@ impl Driver {
 
     fn touch(&self) {
         self.used_ms.store(self.began.elapsed().as_millis() as u64, Ordering::Relaxed);
+    }
+
+    /// Learns what happened while nobody was in here, such as that the connection broke: what is sent into a broken one may
+    /// or may not have arrived.
+    pub fn catch_up(&self, py: Python<'_>) {
+        if self.silent_for() >= ASIDE {
+            self.settle(py);
+        }
     }
 
     fn silent_for(&self) -> Duration {

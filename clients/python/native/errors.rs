@@ -76,11 +76,13 @@ impl From<ClientError> for Failure {
                 let violations = field.into_iter().map(|field| (field, message.clone())).collect();
                 Self { code, message, violations }
             }
-            ClientError::Connect { message, .. } | ClientError::Interrupted { message, .. } => {
-                Self { code, message, violations: Vec::new() }
+            ClientError::Connect { message, .. } => Self { code, message, violations: Vec::new() },
+            // Unlike a server that is away, it may have done what it was asked.
+            ClientError::Interrupted { .. } => {
+                Self { code: Code::Aborted, message: error.to_string(), violations: Vec::new() }
             }
             ClientError::Argument { field, message } => Self::argument(field, message),
-            ClientError::Address { .. } | ClientError::Protocol(_) => {
+            ClientError::Address { .. } | ClientError::Late { .. } | ClientError::Protocol(_) => {
                 Self { code, message: error.to_string(), violations: Vec::new() }
             }
         }

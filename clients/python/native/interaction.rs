@@ -84,6 +84,7 @@ impl Inner {
     }
 
     fn ask_within(&self, py: Python<'_>, timeout: Duration, ask: Ask) -> PyResult<Said> {
+        self.link.driver.catch_up(py);
         Ok(self.link.driver.wait(py, timeout, self.answer(ask))??)
     }
 

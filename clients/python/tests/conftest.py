@@ -1,10 +1,13 @@
 """Real servers on free ports, and environments against them."""
 
+import contextlib
 import os
 import re
 import selectors
 import signal
+import socket
 import subprocess
+import threading
 import time
 from pathlib import Path
 
@@ -106,3 +109,57 @@ def learner_address(tmp_path_factory):
     process = start_learner(tmp_path_factory.mktemp("learner"))
     yield process.address
     process.stop(signal.SIGTERM)
+
+
+class Proxy:
+    """Forwards TCP connections until they are cut."""
+
+    def __init__(self, target):
+        host, _, port = target.rpartition(":")
+        self._target = host, int(port)
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.address = f"127.0.0.1:{self._listener.getsockname()[1]}"
+        self._sockets = []
+        #: While set, what the server answers goes nowhere.
+        self.mute = threading.Event()
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def cut(self):
+        """Breaks every connection; new ones are welcome."""
+        while self._sockets:
+            with contextlib.suppress(OSError):
+                self._sockets.pop().shutdown(socket.SHUT_RDWR)
+
+    def close(self):
+        self._listener.close()
+        self.cut()
+
+    def _accept(self):
+        with contextlib.suppress(OSError):
+            while True:
+                near, _ = self._listener.accept()
+                try:
+                    far = socket.create_connection(self._target)
+                except OSError:
+                    near.close()
+                    continue
+                self._sockets += [near, far]
+                for source, sink, muted in ((near, far, None), (far, near, self.mute)):
+                    threading.Thread(target=self._copy, args=(source, sink, muted), daemon=True).start()
+
+    @staticmethod
+    def _copy(source, sink, muted):
+        with contextlib.suppress(OSError), source:
+            while data := source.recv(65536):
+                if muted is None or not muted.is_set():
+                    sink.sendall(data)
+        with contextlib.suppress(OSError):
+            sink.shutdown(socket.SHUT_RDWR)
+
+
+@pytest.fixture
+def proxy(server):
+    """A way to the shared server that a test can break."""
+    proxy = Proxy(server)
+    yield proxy
+    proxy.close()

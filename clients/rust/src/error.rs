@@ -41,6 +41,12 @@ pub enum ClientError {
         /// What broke.
         message: String,
     },
+    /// No answer within the deadline.
+    #[error("no answer within {secs} s")]
+    Late {
+        /// The deadline.
+        secs: f64,
+    },
     /// The server's answer is not what the protocol says.
     #[error("the server's answer breaks the protocol: {0}")]
     Protocol(String),
@@ -61,6 +67,7 @@ impl ClientError {
             Self::Status { code, .. } => *code,
             Self::Address { .. } | Self::Argument { .. } => Code::InvalidArgument,
             Self::Connect { .. } | Self::Interrupted { .. } => Code::Unavailable,
+            Self::Late { .. } => Code::DeadlineExceeded,
             Self::Protocol(_) => Code::Internal,
         }
     }
@@ -77,6 +84,28 @@ impl ClientError {
     pub(crate) fn protocol(message: impl Into<String>) -> Self {
         Self::Protocol(message.into())
     }
+}
+
+/// An error and what is behind it, in one line.
+pub(crate) fn causes(error: &dyn std::error::Error) -> String {
+    let mut message = error.to_string();
+    let mut source = error.source();
+    while let Some(cause) = source {
+        let cause_message = cause.to_string();
+        if !message.contains(&cause_message) {
+            message = format!("{message}: {cause_message}");
+        }
+        source = cause.source();
+    }
+    message
+}
+
+/// True where the connection and not the server is to blame.
+pub(crate) fn is_broken(status: &Status) -> bool {
+    use std::error::Error as _;
+    matches!(status.code(), Code::Unavailable | Code::Cancelled)
+        || (status.code() == Code::Unknown && status.source().is_some())
+        || (status.code() == Code::Internal && status.message().contains("h2 protocol error"))
 }
 
 impl From<Status> for ClientError {

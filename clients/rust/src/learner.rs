@@ -1,11 +1,16 @@
 //! A learner service: models, recordings and fits, in the messages of `mazeway.learner.v1`.
 
-use crate::{ClientError, Model, ModelCollector, Recorder, connection::channel};
+use crate::{
+    ClientError, ConnectOptions, Model, ModelCollector, Recorder,
+    connect::{Wire, within},
+    retry::reconnecting,
+};
 use mazeway_proto::{
     env::ModelPart,
     learner::{self as pb, fit_response::Event, learner_service_client::LearnerServiceClient},
 };
-use tonic::{Streaming, transport::Channel};
+use std::time::Duration;
+use tonic::Streaming;
 
 /// Largest message taken in: a fit in a large model carries several arrays over all its state-action pairs.
 const MAX_MESSAGE_BYTES: usize = 512 << 20;
@@ -17,8 +22,8 @@ const FIT_PAGE: u32 = 1_000;
 /// A connection to a learner. Cloning shares it.
 #[derive(Debug, Clone)]
 pub struct Learner {
-    channel: Channel,
-    service: LearnerServiceClient<Channel>,
+    wire: Wire,
+    service: LearnerServiceClient<Wire>,
 }
 
 impl Learner {
@@ -27,18 +32,27 @@ impl Learner {
     /// # Errors
     /// An address that is none; nobody answers.
     pub async fn connect(address: &str) -> Result<Self, ClientError> {
-        Ok(Self::from_channel(channel(address).await?))
+        Self::connect_with(address, &ConnectOptions::default()).await
+    }
+
+    /// Connects to a learner at `address`, such as `https://robots.example:50052`, with a token or certificates.
+    ///
+    /// # Errors
+    /// An address that is none, options that do not go with it; nobody answers.
+    pub async fn connect_with(address: &str, options: &ConnectOptions) -> Result<Self, ClientError> {
+        Ok(Self::from_channel(Wire::open(address, options).await?))
     }
 
     /// Uses a channel that is there already.
-    pub fn from_channel(channel: Channel) -> Self {
-        let service = LearnerServiceClient::new(channel.clone()).max_decoding_message_size(MAX_MESSAGE_BYTES);
-        Self { channel, service }
+    pub fn from_channel(channel: impl Into<Wire>) -> Self {
+        let wire = channel.into();
+        let service = LearnerServiceClient::new(wire.clone()).max_decoding_message_size(MAX_MESSAGE_BYTES);
+        Self { wire, service }
     }
 
     /// Begins to record over the same connection.
     pub fn recorder(&self) -> Recorder {
-        Recorder::from_channel(self.channel.clone())
+        Recorder::from_channel(self.wire.clone())
     }
 
     /// Stores a model; returns its id and whether it was stored already.
@@ -64,12 +78,15 @@ impl Learner {
     /// No such model.
     pub async fn model(&self, model_id: &str) -> Result<Model, ClientError> {
         let request = pb::GetModelRequest { model_id: model_id.into() };
-        let mut parts = self.service.clone().get_model(request).await?.into_inner();
-        let mut collector = ModelCollector::default();
-        while let Some(response) = parts.message().await? {
-            collector.push(response.part.unwrap_or_default())?;
-        }
-        Ok(collector.finish()?)
+        let ask = async || {
+            let mut parts = self.wire.within(self.service.clone().get_model(request.clone())).await?;
+            let mut collector = ModelCollector::default();
+            while let Some(response) = within(self.wire.deadline, parts.message()).await? {
+                collector.push(response.part.unwrap_or_default())?;
+            }
+            Ok(collector.finish()?)
+        };
+        reconnecting(ask).await
     }
 
     /// Stores a model that is there in parts: a header, then blocks of rows.
@@ -81,8 +98,12 @@ impl Learner {
     }
 
     async fn send_model(&self, parts: Vec<ModelPart>, replace: bool) -> Result<pb::PutModelResponse, ClientError> {
-        let requests = parts.into_iter().map(move |part| pb::PutModelRequest { part: Some(part), replace });
-        Ok(self.service.clone().put_model(tokio_stream::iter(requests)).await?.into_inner())
+        // A model is known by what is in it: to send it again changes nothing.
+        let ask = async || {
+            let requests = parts.clone().into_iter().map(move |part| pb::PutModelRequest { part: Some(part), replace });
+            self.wire.within(self.service.clone().put_model(tokio_stream::iter(requests))).await
+        };
+        reconnecting(ask).await
     }
 
     /// Models in the order of their ids; an empty `env_id` means any.
@@ -91,7 +112,8 @@ impl Learner {
     /// The learner fails.
     pub async fn list_models(&self, env_id: &str) -> Result<Vec<pb::ModelSummary>, ClientError> {
         let request = pb::ListModelsRequest { env_id: env_id.into() };
-        Ok(self.service.clone().list_models(request).await?.into_inner().models)
+        let ask = async || self.wire.within(self.service.clone().list_models(request.clone())).await;
+        Ok(reconnecting(ask).await?.models)
     }
 
     /// How many trajectories a filter selects.
@@ -133,7 +155,7 @@ impl Learner {
     ) -> Result<pb::ListTrajectoriesResponse, ClientError> {
         let request =
             pb::ListTrajectoriesRequest { filter: Some(filter.clone()), page_size, page_token: token.to_owned() };
-        Ok(self.service.clone().list_trajectories(request).await?.into_inner())
+        reconnecting(async || self.wire.within(self.service.clone().list_trajectories(request.clone())).await).await
     }
 
     /// Deletes what a filter selects and returns how many there were.
@@ -142,7 +164,7 @@ impl Learner {
     /// A malformed filter, or one without a condition.
     pub async fn delete_trajectories(&self, filter: &pb::TrajectoryFilter) -> Result<u64, ClientError> {
         let request = pb::DeleteTrajectoriesRequest { filter: Some(filter.clone()) };
-        Ok(self.service.clone().delete_trajectories(request).await?.into_inner().deleted)
+        Ok(self.wire.within(self.service.clone().delete_trajectories(request)).await?.deleted)
     }
 
     /// Whole trajectories in the order in which they were recorded, as they come.
@@ -151,7 +173,8 @@ impl Learner {
     /// A malformed filter.
     pub async fn export_trajectories(&self, filter: &pb::TrajectoryFilter) -> Result<TrajectoryStream, ClientError> {
         let request = pb::ExportTrajectoriesRequest { filter: Some(filter.clone()) };
-        Ok(TrajectoryStream(self.service.clone().export_trajectories(request).await?.into_inner()))
+        let ask = async || self.wire.within(self.service.clone().export_trajectories(request.clone())).await;
+        Ok(TrajectoryStream(reconnecting(ask).await?, self.wire.deadline))
     }
 
     /// Fits and returns the stored fit; calls `progress` now and then, at most about ten times a second. Dropping the
@@ -179,7 +202,11 @@ impl Learner {
     /// # Errors
     /// Wrong options; all else comes on the stream.
     pub async fn fit_stream(&self, request: pb::FitRequest) -> Result<FitStream, ClientError> {
-        Ok(FitStream(self.service.clone().fit(request).await?.into_inner()))
+        let mut service = self.service.clone();
+        Ok(FitStream(
+            within(self.wire.work_deadline, service.fit(request)).await?.into_inner(),
+            self.wire.work_deadline,
+        ))
     }
 
     /// A stored fit, by its id or eight or more characters of its beginning.
@@ -187,7 +214,9 @@ impl Learner {
     /// # Errors
     /// No such fit, or several.
     pub async fn get_fit(&self, fit_id: &str) -> Result<pb::Fit, ClientError> {
-        let answer = self.service.clone().get_fit(pb::GetFitRequest { fit_id: fit_id.into() }).await?.into_inner();
+        let request = pb::GetFitRequest { fit_id: fit_id.into() };
+        let ask = async || self.wire.within(self.service.clone().get_fit(request.clone())).await;
+        let answer = reconnecting(ask).await?;
         answer.fit.ok_or_else(|| ClientError::protocol("expected a fit, got an empty answer"))
     }
 
@@ -204,7 +233,8 @@ impl Learner {
         };
         let mut all = Vec::new();
         loop {
-            let page = self.service.clone().list_fits(request.clone()).await?.into_inner();
+            let ask = async || self.wire.within(self.service.clone().list_fits(request.clone())).await;
+            let page = reconnecting(ask).await?;
             all.extend(page.fits);
             if page.next_page_token.is_empty() {
                 return Ok(all);
@@ -218,14 +248,14 @@ impl Learner {
     /// # Errors
     /// No such fit.
     pub async fn delete_fit(&self, fit_id: &str) -> Result<(), ClientError> {
-        self.service.clone().delete_fit(pb::DeleteFitRequest { fit_id: fit_id.into() }).await?;
+        self.wire.within(self.service.clone().delete_fit(pb::DeleteFitRequest { fit_id: fit_id.into() })).await?;
         Ok(())
     }
 }
 
 /// Trajectories as they come.
 #[derive(Debug)]
-pub struct TrajectoryStream(Streaming<pb::ExportTrajectoriesResponse>);
+pub struct TrajectoryStream(Streaming<pb::ExportTrajectoriesResponse>, Duration);
 
 impl TrajectoryStream {
     /// The next ones, at least one; `None` after the last.
@@ -234,7 +264,7 @@ impl TrajectoryStream {
     /// The learner fails, or the connection.
     pub async fn next(&mut self) -> Result<Option<Vec<pb::Trajectory>>, ClientError> {
         loop {
-            match self.0.message().await? {
+            match within(self.1, self.0.message()).await? {
                 Some(page) if page.trajectories.is_empty() => {}
                 page => return Ok(page.map(|page| page.trajectories)),
             }
@@ -244,7 +274,7 @@ impl TrajectoryStream {
 
 /// A fit as it goes on.
 #[derive(Debug)]
-pub struct FitStream(Streaming<pb::FitResponse>);
+pub struct FitStream(Streaming<pb::FitResponse>, Duration);
 
 impl FitStream {
     /// The next progress, or the fit, which is last; `None` after it.
@@ -253,7 +283,7 @@ impl FitStream {
     /// Nothing to fit on, an unknown model, wrong options, a learner that fails.
     pub async fn next(&mut self) -> Result<Option<Event>, ClientError> {
         loop {
-            match self.0.message().await? {
+            match within(self.1, self.0.message()).await? {
                 Some(pb::FitResponse { event: Some(event) }) => return Ok(Some(event)),
                 // An event of a newer release.
                 Some(_) => {}

@@ -19,6 +19,7 @@
 //! # }
 //! ```
 
+mod connect;
 mod connection;
 mod env;
 mod error;
@@ -26,7 +27,9 @@ pub mod info;
 pub mod learner;
 pub mod model;
 pub mod packed;
+mod patience;
 pub mod recorder;
+mod retry;
 pub mod rollout;
 mod session;
 pub mod spec;
@@ -34,7 +37,8 @@ mod stream;
 mod vector;
 mod watch;
 
-pub use connection::{Connection, channel, list_environments, model, rollout};
+pub use connect::{ClientCertificate, ConnectFiles, ConnectOptions, Token, Wire, channel};
+pub use connection::{Connection, list_environments, model, rollout};
 pub use env::{Env, Step};
 pub use error::ClientError;
 pub use info::{Infos, Observation, Observations};

@@ -4,16 +4,13 @@
 //! and sent again when the connection comes back; its UUID, made here, is what makes that safe. Trajectories are sent in
 //! batches, several under way at a time, and stored in the order in which they were given.
 
-use crate::{ClientError, connection::channel, packed::pack};
+use crate::{ClientError, ConnectOptions, connect::Wire, packed::pack, retry::Backoff};
 use bytes::Bytes;
 use mazeway_proto::learner::{self as pb, learner_service_client::LearnerServiceClient};
-use std::{
-    collections::VecDeque,
-    time::{Duration, Instant},
-};
-use tokio::{sync::mpsc, time::sleep};
+use std::{collections::VecDeque, future::Future, time::Duration};
+use tokio::{sync::mpsc, time::timeout};
 use tokio_stream::wrappers::ReceiverStream;
-use tonic::{Code, Status, Streaming, transport::Channel};
+use tonic::{Code, Status, Streaming};
 use uuid::Uuid;
 
 /// Trajectories in a request at most.
@@ -97,7 +94,7 @@ impl Receipt {
 /// Records trajectories over one stream. [`Recorder::finish`] it: what is dropped unfinished may not arrive.
 #[derive(Debug)]
 pub struct Recorder {
-    service: LearnerServiceClient<Channel>,
+    service: LearnerServiceClient<Wire>,
     stream: Option<Open>,
     batch: Vec<pb::Trajectory>,
     batch_bytes: usize,
@@ -105,6 +102,8 @@ pub struct Recorder {
     waiting: VecDeque<pb::RecordTrajectoriesRequest>,
     receipt: Receipt,
     retry_for: Duration,
+    /// Longest wait for an answer; then the stream counts as broken.
+    deadline: Duration,
 }
 
 /// A stream that is open.
@@ -122,13 +121,15 @@ impl Recorder {
     /// # Errors
     /// An address that is none; nobody answers.
     pub async fn connect(address: &str) -> Result<Self, ClientError> {
-        Ok(Self::from_channel(channel(address).await?))
+        Ok(Self::from_channel(Wire::open(address, &ConnectOptions::default()).await?))
     }
 
     /// Uses a channel that is there already.
-    pub fn from_channel(channel: Channel) -> Self {
+    pub fn from_channel(channel: impl Into<Wire>) -> Self {
+        let wire = channel.into();
         Self {
-            service: LearnerServiceClient::new(channel),
+            deadline: wire.deadline,
+            service: LearnerServiceClient::new(wire),
             stream: None,
             batch: Vec::new(),
             batch_bytes: 0,
@@ -201,7 +202,7 @@ impl Recorder {
 
     /// Sends and receives until at most `left` requests wait for their answer and all are sent.
     async fn exchange(&mut self, left: usize) -> Result<(), ClientError> {
-        let (mut since, mut pause) = (None::<Instant>, PAUSES.0);
+        let mut backoff = None;
         let mut acknowledged = self.receipt.acknowledged();
         loop {
             let Err(status) = self.try_exchange(left).await else { return Ok(()) };
@@ -212,14 +213,13 @@ impl Recorder {
             if self.receipt.acknowledged() > acknowledged {
                 // It got on meanwhile: this is another interruption.
                 acknowledged = self.receipt.acknowledged();
-                (since, pause) = (None, PAUSES.0);
-            }
-            if since.get_or_insert_with(Instant::now).elapsed() >= self.retry_for {
-                return Err(status.into());
+                backoff = None;
             }
             tracing::debug!(%status, "the recording stream broke; trying again");
-            sleep(pause).await;
-            pause = (pause * 2).min(PAUSES.1);
+            let backoff = backoff.get_or_insert_with(|| Backoff::new(PAUSES.0, PAUSES.1, self.retry_for));
+            if !backoff.pause().await {
+                return Err(status.into());
+            }
         }
     }
 
@@ -231,18 +231,19 @@ impl Recorder {
             }
             let stream = match &mut self.stream {
                 Some(stream) => stream,
-                None => self.stream.insert(open(&mut self.service).await?),
+                None => self.stream.insert(in_time(self.deadline, open(&mut self.service)).await?),
             };
             if stream.sent < self.waiting.len() && stream.sent < IN_FLIGHT {
                 // Cheap: the arrays are shared.
                 let request = self.waiting[stream.sent].clone();
-                if stream.requests.send(request).await.is_ok() {
+                let sent = async { Ok(stream.requests.send(request).await) };
+                if in_time(self.deadline, sent).await?.is_ok() {
                     stream.sent += 1;
                     continue;
                 }
                 // The stream has ended: its status lies behind the answers.
             }
-            let answer = stream.answers.message().await?;
+            let answer = in_time(self.deadline, stream.answers.message()).await?;
             let Some(answer) = answer else { return Err(Status::unavailable("the learner ended the stream")) };
             let Some(request) = self.waiting.pop_front() else {
                 return Err(Status::data_loss("an answer without a request"));
@@ -297,7 +298,13 @@ impl Drop for Recorder {
     }
 }
 
-async fn open(service: &mut LearnerServiceClient<Channel>) -> Result<Open, Status> {
+/// What does not come in time is as good as lost.
+async fn in_time<T>(deadline: Duration, wait: impl Future<Output = Result<T, Status>>) -> Result<T, Status> {
+    let late = |_| Status::unavailable(format!("no answer within {} s", deadline.as_secs_f64()));
+    timeout(deadline, wait).await.map_err(late)?
+}
+
+async fn open(service: &mut LearnerServiceClient<Wire>) -> Result<Open, Status> {
     let (requests, stream) = mpsc::channel(IN_FLIGHT);
     let answers = service.record_trajectories(ReceiverStream::new(stream)).await?.into_inner();
     Ok(Open { requests, answers, sent: 0 })

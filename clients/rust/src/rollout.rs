@@ -2,11 +2,13 @@
 
 use crate::{
     ClientError,
+    connect::within,
     packed::{Packed, pack},
     spec::{Options, options_to_wire},
 };
 use bytes::Bytes;
 use mazeway_proto::env as pb;
+use std::time::Duration;
 use tonic::Streaming;
 
 /// Who acts.
@@ -266,11 +268,18 @@ pub struct EpisodeStream {
     asked: u32,
     next_episode: u32,
     totals_only: bool,
+    /// Longest wait for a message.
+    deadline: Duration,
 }
 
 impl EpisodeStream {
-    pub(crate) fn new(answers: Streaming<pb::RolloutResponse>, asked: u32, totals_only: bool) -> Self {
-        Self { answers, asked, next_episode: 0, totals_only }
+    pub(crate) fn new(
+        answers: Streaming<pb::RolloutResponse>,
+        asked: u32,
+        totals_only: bool,
+        deadline: Duration,
+    ) -> Self {
+        Self { answers, asked, next_episode: 0, totals_only, deadline }
     }
 
     /// The next few episodes; `None` once all have come.
@@ -293,7 +302,7 @@ impl EpisodeStream {
     }
 
     async fn append_next(&mut self, episodes: &mut Episodes) -> Result<bool, ClientError> {
-        let Some(answer) = self.answers.message().await? else {
+        let Some(answer) = within(self.deadline, self.answers.message()).await? else {
             return if self.next_episode == self.asked {
                 Ok(false)
             } else {

@@ -5,17 +5,20 @@
 
 use crate::{
     ClientError, Connection, EnvSpec,
+    error::is_broken,
+    patience::Patience,
+    retry::{Backoff, RECONNECT, reconnecting},
     spec::{Options, options_to_wire},
     stream::{Ask, Open, Sent},
 };
 use mazeway_proto::env::{self as pb, AutoresetMode, interact_response::Response};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 use tonic::{Code, Status};
 
+/// First and longest pause between two attempts to take a session up again.
+const PAUSES: (Duration, Duration) = (Duration::from_millis(5), Duration::from_millis(500));
 /// Requests that may be sent before the first of their answers is received.
 const MAX_UNDER_WAY: usize = 4096;
-/// How long a session is tried to be taken up again, unless asked otherwise.
-const RESUME: Duration = Duration::from_secs(10);
 
 /// What happens to an environment whose episode has ended (Gymnasium 1.x).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -72,15 +75,8 @@ pub(crate) struct Session {
     pub max_episode_steps: u32,
     resume_within: Duration,
     open: Option<Open>,
+    patience: Patience,
     closed: bool,
-}
-
-/// True where the connection and not the server is to blame.
-fn is_broken(status: &Status) -> bool {
-    use std::error::Error as _;
-    matches!(status.code(), Code::Unavailable | Code::Cancelled)
-        || (status.code() == Code::Unknown && status.source().is_some())
-        || (status.code() == Code::Internal && status.message().contains("h2 protocol error"))
 }
 
 impl Session {
@@ -106,7 +102,9 @@ impl Session {
             lease: lease.map_err(|error| ClientError::Argument { field: "lease", message: error.to_string() })?,
             action_masks: options.action_masks,
         };
-        let answer = connection.service.clone().create_session(request).await?.into_inner();
+        // A session whose answer was lost ends with its lease: to ask for another does no harm.
+        let ask = async || connection.wire.within(connection.service.clone().create_session(request.clone())).await;
+        let answer = reconnecting(ask).await?;
         Self::attach(connection, answer, options.resume_within)
     }
 
@@ -117,14 +115,15 @@ impl Session {
         resume_within: Option<Duration>,
     ) -> Result<Self, ClientError> {
         let spec = created.spec.ok_or_else(|| ClientError::protocol("expected a description of the session"))?;
-        let lease = created.lease.and_then(|lease| Duration::try_from(lease).ok()).unwrap_or(RESUME);
+        let lease = created.lease.and_then(|lease| Duration::try_from(lease).ok()).unwrap_or(RECONNECT);
         Ok(Self {
+            patience: Patience::new(connection.wire.deadline),
             connection,
             id: created.session_id,
             spec: EnvSpec::from_wire(spec)?,
             num_envs: created.num_envs as usize,
             max_episode_steps: created.max_episode_steps,
-            resume_within: resume_within.unwrap_or(RESUME).min(lease),
+            resume_within: resume_within.unwrap_or(RECONNECT).min(lease),
             open: None,
             closed: false,
         })
@@ -134,12 +133,20 @@ impl Session {
         &self.id
     }
 
-    /// The stream, opened anew where there is none, and the session's id.
-    async fn stream(&mut self) -> Result<(&mut Open, &str), Status> {
+    /// Opens a stream where there is none.
+    async fn ensure_open(&mut self) -> Result<(), Status> {
         if self.open.is_none() {
-            self.open = Some(Open::new(self.connection.channel.clone()).await?);
+            let opening = self.patience.wait(Open::new(self.connection.wire.clone())).await;
+            let opened = opening.unwrap_or_else(|late| Err(Status::unavailable(late.to_string())))?;
+            self.open = Some(opened);
         }
-        Ok((self.open.as_mut().expect("just opened"), &self.id))
+        Ok(())
+    }
+
+    /// Writes a request to the open stream.
+    async fn write(&mut self, ask: Ask<'_>) -> Result<Sent, ClientError> {
+        let Some(open) = &mut self.open else { return Ok(Sent::Ended) };
+        self.patience.wait(open.send(ask, &self.id)).await
     }
 
     /// Sends a request whose answer [`Self::receive`] will bring.
@@ -147,16 +154,17 @@ impl Session {
         if self.closed {
             return Err(ClientError::Argument { field: "session_id", message: "the environment was closed".into() });
         }
-        let (open, id) = self.stream().await?;
+        self.ensure_open().await?;
         let too_many = |message| Err(ClientError::Argument { field: "request", message });
-        if open.awaited == MAX_UNDER_WAY {
+        let awaited = self.open.as_ref().map_or(0, |open| open.awaited);
+        if awaited == MAX_UNDER_WAY {
             return too_many(format!("expected at most {MAX_UNDER_WAY} requests without receiving their answers"));
         }
-        match open.send(ask, id).await {
+        match self.write(ask).await? {
             Sent::Yes => Ok(()),
             Sent::Full => too_many("expected the answers that are waiting to be received before more is sent".into()),
             // Where it ended with answers to come, the last of these says why.
-            Sent::Ended if open.awaited > 0 => Ok(()),
+            Sent::Ended if awaited > 0 => Ok(()),
             Sent::Ended => {
                 self.open = None;
                 Err(ClientError::Interrupted { request: ask.name(), message: "the stream ended".into() })
@@ -172,7 +180,14 @@ impl Session {
                 message: "nothing was asked that is not answered".into(),
             });
         };
-        match open.answer().await {
+        let answer = match self.patience.wait(open.answer()).await {
+            Ok(answer) => answer,
+            Err(late) => {
+                self.open = None;
+                return Err(late);
+            }
+        };
+        match answer {
             Ok(Some(pb::InteractResponse { response: Some(response) })) => {
                 open.awaited -= 1;
                 Ok(response)
@@ -196,19 +211,20 @@ impl Session {
     /// Sends a request and waits for its answer; takes the session up again where the connection broke before.
     pub async fn call(&mut self, ask: Ask<'_>) -> Result<Response, ClientError> {
         self.settle().await;
-        let (mut give_up, mut pause) = (None, Duration::from_millis(5));
+        let mut backoff = None;
         loop {
             let error = match self.try_call(ask).await {
                 Ok(response) => return Ok(response),
                 Err(error) => error,
             };
-            // The clock is asked once something is wrong.
-            let give_up = *give_up.get_or_insert_with(|| Instant::now() + self.resume_within);
-            if !error.retry || Instant::now() + pause > give_up {
+            if !error.retry {
                 return Err(error.error);
             }
-            tokio::time::sleep(pause).await;
-            pause = (pause * 2).min(Duration::from_millis(500));
+            // The clock is asked once something is wrong.
+            let backoff = backoff.get_or_insert_with(|| Backoff::new(PAUSES.0, PAUSES.1, self.resume_within));
+            if !backoff.pause().await {
+                return Err(error.error);
+            }
         }
     }
 
@@ -228,14 +244,24 @@ impl Session {
         }
         let fresh = self.open.is_none();
         // Nothing was sent yet: whatever fails here may be tried again.
-        let stream = self.stream().await;
-        let (open, id) = stream.map_err(|status| Attempt { retry: is_broken(&status), error: status.into() })?;
-        if open.send(ask, id).await != Sent::Yes {
+        let opened = self.ensure_open().await;
+        opened.map_err(|status| Attempt { retry: is_broken(&status), error: status.into() })?;
+        if self.write(ask).await.map_err(Attempt::last)? != Sent::Yes {
             self.open = None;
             let error = ClientError::Interrupted { request: ask.name(), message: "the stream ended".into() };
             return Err(Attempt { retry: true, error });
         }
-        let answer = open.answer().await;
+        let Some(open) = &mut self.open else {
+            return Err(Attempt::last(ClientError::protocol("expected a stream that was just opened")));
+        };
+        let answer = match self.patience.wait(open.answer()).await {
+            Ok(answer) => answer,
+            Err(late) => {
+                // Whether it was carried out nobody knows.
+                self.open = None;
+                return Err(Attempt::last(late));
+            }
+        };
         let retry = !matches!(answer, Ok(Some(_))) && (ask.is_repeatable() || open.is_unsent());
         let broken =
             |message: String| Attempt { retry, error: ClientError::Interrupted { request: ask.name(), message } };
@@ -269,7 +295,8 @@ impl Session {
             RenderMode::Png => pb::RenderMode::Png,
         };
         let request = pb::RenderRequest { session_id: self.id.clone(), index, mode: mode.into() };
-        Ok(self.connection.service.clone().render(request).await?.into_inner())
+        let Connection { wire, service } = &self.connection;
+        reconnecting(async || wire.within(service.clone().render(request.clone())).await).await
     }
 
     pub async fn render_image(&mut self, index: u32) -> Result<Image, ClientError> {
@@ -290,7 +317,7 @@ impl Session {
         match outcome {
             Ok(_) => Ok(()),
             // It is gone already, which is what was wanted.
-            Err(error) if matches!(error.code(), Code::NotFound | Code::DeadlineExceeded) => Ok(()),
+            Err(ClientError::Status { code: Code::NotFound | Code::DeadlineExceeded, .. }) => Ok(()),
             Err(error) => Err(error),
         }
     }

@@ -25,11 +25,10 @@ use tonic::{
     codec::BufferSettings,
     codegen::{Service as _, http},
     metadata::GRPC_CONTENT_TYPE,
-    transport::Channel,
 };
 use tonic_prost::ProstCodec;
 
-use crate::connection::MAX_MESSAGE_BYTES;
+use crate::{connect::Wire, connection::MAX_MESSAGE_BYTES};
 
 /// The method.
 const INTERACT: &str = "/mazeway.env.v1.EnvironmentService/Interact";
@@ -228,7 +227,7 @@ pub(crate) struct Open {
 }
 
 impl Open {
-    pub async fn new(mut channel: Channel) -> Result<Self, Status> {
+    pub async fn new(mut channel: Wire) -> Result<Self, Status> {
         let outbox = Shared::default();
         let mut request = http::Request::post(INTERACT)
             .header(http::header::TE, "trailers")

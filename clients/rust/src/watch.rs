@@ -84,6 +84,6 @@ impl Connection {
             max_fps: options.max_fps.unwrap_or_default(),
             max_width: options.max_width.unwrap_or_default(),
         };
-        Ok(Frames(self.service.clone().watch(request).await?.into_inner()))
+        Ok(Frames(self.wire.within(self.service.clone().watch(request)).await?))
     }
 }

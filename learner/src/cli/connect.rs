@@ -4,8 +4,9 @@ use super::{
     StoreArgs, data_directory,
     embedded::{self, Embedded},
     error::CliError,
+    unreachable,
 };
-use mazeway_client::Learner;
+use mazeway_client::{ClientError, Learner};
 
 /// A connection, and the guard of what was started for it.
 pub struct Connected {
@@ -20,7 +21,12 @@ pub struct Connected {
 /// Nobody answers at the address; the data directory cannot be used.
 pub async fn connect(store: &StoreArgs) -> Result<Connected, CliError> {
     if let Some(address) = &store.addr {
-        return Ok(Connected { learner: Learner::connect(address).await?, embedded: None });
+        let options = store.access.options(address)?;
+        let learner = Learner::connect_with(address, &options).await.map_err(|error| match error {
+            ClientError::Argument { .. } => unreachable(&error, ""),
+            error => error.into(),
+        })?;
+        return Ok(Connected { learner, embedded: None });
     }
     let service = embedded::learner(&data_directory(store.data.clone())?).await?;
     let learner = Learner::connect(&service.address()).await?;

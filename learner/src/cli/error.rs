@@ -71,6 +71,9 @@ impl From<ClientError> for CliError {
                 Code::Unavailable | Code::Cancelled | Code::DeadlineExceeded => {
                     "try again; what was acknowledged is stored"
                 }
+                Code::Unauthenticated | Code::PermissionDenied => {
+                    "name a file with a token that is good for this: --token-file, or MAZEWAY_TOKEN_FILE"
+                }
                 Code::DataLoss => {
                     "see what is damaged with 'learner verify'; 'learner repair' takes over what is sound"
                 }

@@ -22,6 +22,7 @@ mod table;
 use clap::{Args, CommandFactory as _, Parser, Subcommand};
 use directories::ProjectDirs;
 use error::CliError;
+use mazeway_client::{ClientError, ConnectFiles, ConnectOptions};
 use std::{path::PathBuf, process::ExitCode, time::Duration};
 use tracing_subscriber::EnvFilter;
 
@@ -72,6 +73,64 @@ pub struct StoreArgs {
     /// Address of a running learner service, such as 127.0.0.1:50052, which has its own directory
     #[arg(long, value_name = "HOST:PORT")]
     pub addr: Option<String>,
+    #[command(flatten)]
+    pub access: AccessArgs,
+}
+
+/// How running services know this program, and it them.
+#[derive(Debug, Clone, Default, Args)]
+#[command(next_help_heading = "Access to running services")]
+pub struct AccessArgs {
+    /// File that holds a token, and nothing else [default: MAZEWAY_TOKEN_FILE, or the token itself in MAZEWAY_TOKEN]
+    #[arg(long, value_name = "FILE")]
+    token_file: Option<PathBuf>,
+    /// Authorities, in PEM, that may vouch for an https:// address [default: MAZEWAY_TLS_CA, or the system's]
+    #[arg(long, value_name = "FILE")]
+    tls_ca: Option<PathBuf>,
+    /// Certificate of this program, in PEM [default: MAZEWAY_TLS_CERT]
+    #[arg(long, value_name = "FILE")]
+    tls_cert: Option<PathBuf>,
+    /// Private key of that certificate, in PEM [default: MAZEWAY_TLS_KEY]
+    #[arg(long, value_name = "FILE")]
+    tls_key: Option<PathBuf>,
+    /// Send the token unencrypted to addresses beyond this machine
+    #[arg(long)]
+    token_in_clear: bool,
+}
+
+impl AccessArgs {
+    /// How to connect to an address.
+    ///
+    /// # Errors
+    /// A file that cannot be read; certificates for an address that has none.
+    pub fn options(&self, address: &str) -> Result<ConnectOptions, CliError> {
+        let files = ConnectFiles {
+            token: self.token_file.clone(),
+            ca: self.tls_ca.clone(),
+            cert: self.tls_cert.clone(),
+            key: self.tls_key.clone(),
+        };
+        let options = files.read(address).map_err(|error| {
+            let hint = "give readable files: --token-file, --tls-ca, --tls-cert and --tls-key";
+            CliError::usage(error.to_string(), hint)
+        })?;
+        Ok(ConnectOptions { insecure: self.token_in_clear, ..options })
+    }
+}
+
+/// What went wrong on the way to a service; `start` says how one is started.
+pub fn unreachable(error: &ClientError, start: impl Into<String>) -> CliError {
+    match error {
+        ClientError::Argument { field: "token", .. } => CliError::usage(
+            error.to_string(),
+            "give an https:// address, or --token-in-clear where the network is trusted",
+        ),
+        ClientError::Argument { .. } => CliError::usage(
+            error.to_string(),
+            "give an address such as 127.0.0.1:50052, or https://host:port with --tls-ca",
+        ),
+        _ => CliError::failure(error.to_string(), start),
+    }
 }
 
 /// Whether a word names a command.

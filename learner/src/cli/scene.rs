@@ -4,14 +4,16 @@
 //! environment, its options and a seed; those of `learner fit --seed S` and of a comparison's seed S are the same.
 
 use super::{
+    AccessArgs,
     embedded::{self, Embedded},
     error::CliError,
     fit::{
         assemble::Truth,
         recordings::{Expert, demonstration_seed, evaluation_seed},
     },
+    unreachable,
 };
-use mazeway_client::{Connection, EnvSpec, Episodes, Model, Options, Rollout};
+use mazeway_client::{ConnectOptions, Connection, EnvSpec, Episodes, Model, Options, Rollout};
 use mazeway_learner::{
     mdp::{PlanOptions, PlannerKind, TabularMdp, plan},
     trajectory::Trajectory,
@@ -31,7 +33,7 @@ impl Environments {
     ///
     /// # Errors
     /// Nobody answers at the address; no port can be bound.
-    pub async fn start(address: Option<&str>) -> Result<Self, CliError> {
+    pub async fn start(address: Option<&str>, access: &AccessArgs) -> Result<Self, CliError> {
         let embedded = match address {
             Some(_) => None,
             None => Some(embedded::environments().await?),
@@ -41,11 +43,9 @@ impl Environments {
             (None, Some(address)) => address.to_owned(),
             (None, None) => unreachable!("started above"),
         };
-        let connection = Connection::open(&address).await.map_err(|error| {
-            CliError::failure(
-                error.to_string(),
-                format!("start one with 'server --listen {address}', or leave out --env-addr"),
-            )
+        let options = if embedded.is_some() { ConnectOptions::default() } else { access.options(&address)? };
+        let connection = Connection::connect(&address, &options).await.map_err(|error| {
+            unreachable(&error, format!("start one with 'server --listen {address}', or leave out --env-addr"))
         })?;
         Ok(Self { connection, address, embedded })
     }

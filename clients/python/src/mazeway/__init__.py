@@ -18,9 +18,12 @@ import gymnasium
 from mazeway.client import Client, Environment, Rollout
 from mazeway.env import REGISTERED, MazewayEnv
 from mazeway.errors import (
+    AccessDeniedError,
     AlreadyExistsError,
     CancelledError,
+    ConnectionLostError,
     DeadlineExceededError,
+    EpisodeLostError,
     InvalidArgumentError,
     LimitReachedError,
     MazewayError,
@@ -44,11 +47,14 @@ from mazeway.watching import Frame, watch
 __version__ = "0.1.0"
 
 __all__ = [
+    "AccessDeniedError",
     "AlreadyExistsError",
     "CancelledError",
     "Client",
+    "ConnectionLostError",
     "DeadlineExceededError",
     "Environment",
+    "EpisodeLostError",
     "Fit",
     "FitSummary",
     "Frame",

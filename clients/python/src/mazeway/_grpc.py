@@ -7,6 +7,7 @@ channel go before a fork and connects again, in parent and child alike, with the
 from __future__ import annotations
 
 import contextlib
+import functools
 import math
 import os
 import threading
@@ -19,7 +20,15 @@ from typing import Any
 import grpc
 
 from mazeway import _wire
-from mazeway._transport import MAX_MESSAGE_BYTES, START, Exchange, late
+from mazeway._access import Credentials
+from mazeway._transport import (
+    MAX_MESSAGE_BYTES,
+    REPEATABLE,
+    START,
+    Exchange,
+    late,
+    reconnecting,
+)
 from mazeway.errors import MazewayError, ServerFailureError, ServerUnreachableError, from_status
 
 #: How long a fork waits for a call that another thread is making.
@@ -32,8 +41,15 @@ _FORK_REST_SECS = 0.05
 class GrpcTransport:
     """The transport over grpcio."""
 
-    def __init__(self, target: str, service: str, *, secure: bool = False) -> None:
-        """Takes "host:port" or "unix:path", and whether to use TLS."""
+    def __init__(
+        self,
+        target: str,
+        service: str,
+        *,
+        secure: bool = False,
+        credentials: Credentials | None = None,
+    ) -> None:
+        """Takes "host:port" or "unix:path", whether to use TLS, and what goes along."""
         self.address = target
         self.service = service
         self._methods = _wire.services[service]
@@ -44,6 +60,10 @@ class GrpcTransport:
             ("grpc.use_local_subchannel_pool", 1),
             ("grpc.initial_reconnect_backoff_ms", 100),
             ("grpc.max_reconnect_backoff_ms", 1000),
+            # A peer that vanished without a word is found out.
+            ("grpc.keepalive_time_ms", 10_000),
+            ("grpc.keepalive_timeout_ms", 10_000),
+            ("grpc.http2.max_pings_without_data", 0),
         ]
         if target.startswith("unix:"):
             # Else the path goes into the `:authority`, which is none, and servers reset the stream.
@@ -51,6 +71,9 @@ class GrpcTransport:
         if target.rpartition(":")[0] in ("127.0.0.1", "localhost", "[::1]"):
             options.append(("grpc.enable_http_proxy", 0))
         self._target, self._secure, self._options = target, secure, options
+        self._credentials = credentials or Credentials()
+        #: True once the server has answered: from then on it is waited for when it goes away.
+        self._known = False
         self._channel: Any = None
         self._callables: dict[str, Callable[..., Any]] = {}
         self._exchanges: weakref.WeakSet[_GrpcExchange] = weakref.WeakSet()
@@ -64,8 +87,14 @@ class GrpcTransport:
 
     def unary(self, method: str, request: Any, *, timeout: float) -> Any:
         """See `Transport`."""
-        with self._translated(timeout), self._lock:
-            return self._callable(method)(request, timeout=timeout)
+
+        def call() -> Any:
+            with self._translated(timeout), self._lock:
+                answer = self._callable(method)(request, timeout=timeout)
+            self._known = True
+            return answer
+
+        return reconnecting(call, timeout) if self._known and method in REPEATABLE else call()
 
     def responses(self, method: str, request: Any, *, timeout: float, each: bool = False) -> Iterator[Any]:
         """See `Transport`."""
@@ -167,7 +196,7 @@ class GrpcTransport:
     def _callable(self, name: str) -> Callable[..., Any]:
         if self._channel is None:
             self._channel = (
-                grpc.secure_channel(self._target, grpc.ssl_channel_credentials(), self._options)
+                grpc.secure_channel(self._target, self._tls(), self._options)
                 if self._secure
                 else grpc.insecure_channel(self._target, self._options)
             )
@@ -176,12 +205,20 @@ class GrpcTransport:
             kind = ("stream" if method.client_streaming else "unary") + (
                 "_stream" if method.server_streaming else "_unary"
             )
-            self._callables[name] = getattr(self._channel, kind)(
+            call = getattr(self._channel, kind)(
                 method.path,
                 request_serializer=method.request.SerializeToString,
                 response_deserializer=method.response.FromString,
             )
+            if self._credentials.token is not None:
+                metadata = (("authorization", f"Bearer {self._credentials.token}"),)
+                call = functools.partial(call, metadata=metadata)
+            self._callables[name] = call
         return self._callables[name]
+
+    def _tls(self) -> grpc.ChannelCredentials:
+        files = self._credentials
+        return grpc.ssl_channel_credentials(files.ca, files.key, files.cert)
 
 
 def _is_local_deadline(error: grpc.RpcError) -> bool:
@@ -224,6 +261,11 @@ class _GrpcAnswers:
         self.expired = False
         if timeout < math.inf:
             _watchdog.watch(self)
+
+    @property
+    def over(self) -> bool:
+        """Whether the stream has ended, as far as is known here."""
+        return not self.alive or not self._call.is_active()
 
     def next(self) -> Any:
         """The next answer; None where there are no more."""

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import operator
-import time
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -18,15 +17,16 @@ import numpy as np
 import numpy.typing as npt
 
 from mazeway import _arrays, _wire
-from mazeway._transport import Exchange, Transport
+from mazeway._transport import Backoff, Exchange, Transport
 from mazeway.errors import MazewayError, SessionInUseError
 
 if TYPE_CHECKING:
     from mazeway._native_transport import NativeTransport
 
-#: Longest wait for the server to notice that a stream of ours is gone, and pauses between attempts meanwhile.
+#: Longest wait for the server to notice that a stream of ours is gone.
 _SETTLE_SECS = 10.0
-_PAUSES_SECS = (0.005, 0.25)
+
+_CATALOGUE = _wire.env.ListEnvironmentsRequest()
 
 #: Which environments are meant, shape (num_envs,).
 Mask = npt.NDArray[np.bool_]
@@ -147,6 +147,8 @@ class MessageLink:
         self._exchange: Exchange | None = None
         #: What was sent on a stream that has not answered yet; None from its first answer on.
         self._opening: list[Any] | None = None
+        #: Requests whose answer nobody has received.
+        self._awaited = 0
         self._n_actions = spec.n_actions
         self._dtype = _arrays.space_dtype(spec.observation_space)
         space = _arrays.space_from_wire(spec.observation_space)
@@ -250,18 +252,25 @@ class MessageLink:
         return self._receive()
 
     def _send(self, request: Any) -> None:
-        if self._exchange is None or not self._exchange.alive:
+        if self._exchange is None or not self._exchange.alive or (not self._awaited and self._exchange.over):
+            if self._exchange is not None:
+                # Nothing is known to be lost: the session is taken up where it stands. But what is sent
+                # before the server is there again might be.
+                self._transport.unary("ListEnvironments", _CATALOGUE, timeout=self._timeout)
             self._exchange = self._transport.exchange("Interact", timeout=self._timeout)
+            self._awaited = 0
             getattr(request, request.WhichOneof("request")).session_id = self._session_id
             self._opening = []
         if self._opening is not None:
             self._opening.append(request)
         self._exchange.send(request)
+        self._awaited += 1
 
     def _receive(self) -> Any:
         if self._exchange is None:
             raise MazewayError("expected an answer that was asked for")
         opening, self._opening = self._opening, None
+        self._awaited -= 1
         try:
             return self._exchange.receive()
         except SessionInUseError:
@@ -278,16 +287,13 @@ class MessageLink:
 
     def _insist(self, call: Callable[[], Any], timeout: float) -> Any:
         """Calls until the session is free, within bounds."""
-        deadline = time.monotonic() + min(0.8 * timeout, _SETTLE_SECS)
-        pause, longest = _PAUSES_SECS
+        backoff = Backoff(min(0.8 * timeout, _SETTLE_SECS), first=0.005, longest=0.25)
         while True:
             try:
                 return call()
             except SessionInUseError:
-                if time.monotonic() + pause > deadline:
+                if not backoff.pause():
                     raise
-            time.sleep(pause)
-            pause = min(2 * pause, longest)
 
     def _first(self, response: Any) -> First:
         return self._observations(response.observations), self._batch(response.infos)

@@ -37,7 +37,15 @@ class Keeper:
 class Channel:
     """One connection to a server; connects with the first call. Timeouts are in seconds."""
 
-    def __new__(cls, address: str, keeper: Keeper) -> Channel: ...
+    def __new__(
+        cls,
+        address: str,
+        keeper: Keeper,
+        token: str | None = None,
+        ca: bytes | None = None,
+        cert: bytes | None = None,
+        key: bytes | None = None,
+    ) -> Channel: ...
     def unary(self, path: str, request: bytes, timeout: float) -> bytes: ...
     def requests(self, path: str, requests: Sequence[bytes], timeout: float) -> bytes: ...
     def answers(self, path: str, request: bytes) -> Answers: ...

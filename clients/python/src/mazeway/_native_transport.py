@@ -14,7 +14,8 @@ from collections.abc import Iterable, Iterator
 from typing import Any
 
 from mazeway import _native, _wire
-from mazeway._transport import START, Exchange, late
+from mazeway._access import Credentials
+from mazeway._transport import REPEATABLE, START, Exchange, late, reconnecting
 from mazeway.errors import MazewayError, ServerFailureError, from_status
 
 _keeper: tuple[int, _native.Keeper] | None = None
@@ -31,20 +32,37 @@ def _keep() -> _native.Keeper:
 class NativeTransport:
     """Calls as bytes through `mazeway._native.Channel`."""
 
-    def __init__(self, target: str, service: str) -> None:
-        """Takes "host:port" or "unix:path"."""
+    def __init__(
+        self,
+        target: str,
+        service: str,
+        *,
+        secure: bool = False,
+        credentials: Credentials | None = None,
+    ) -> None:
+        """Takes "host:port" or "unix:path", whether to use TLS, and what goes along."""
         self.address = target
         self.service = service
         self._methods = _wire.services[service]
         self._channel: _native.Channel | None = None
+        self._secure = secure
+        self._credentials = credentials or Credentials()
+        #: True once the server has answered: from then on it is waited for when it goes away.
+        self._known = False
         self._pid = os.getpid()
 
     def unary(self, method: str, request: Any, *, timeout: float) -> Any:
         """See `Transport`."""
         called = self._methods[method]
-        with self.translated(timeout):
-            answer = self.channel().unary(called.path, request.SerializeToString(), timeout)
-        return called.response.FromString(answer)
+
+        def call() -> bytes:
+            with self.translated(timeout):
+                answer = self.channel().unary(called.path, request.SerializeToString(), timeout)
+            self._known = True
+            return answer
+
+        repeat = self._known and method in REPEATABLE
+        return called.response.FromString(reconnecting(call, timeout) if repeat else call())
 
     def responses(self, method: str, request: Any, *, timeout: float, each: bool = False) -> Iterator[Any]:
         """See `Transport`."""
@@ -85,7 +103,9 @@ class NativeTransport:
         """The connection, which is another one in a forked child."""
         if self._channel is None or self._pid != os.getpid():
             self._pid = os.getpid()
-            self._channel = _native.Channel(self.address, _keep())
+            address = f"https://{self.address}" if self._secure else self.address
+            files = self._credentials
+            self._channel = _native.Channel(address, _keep(), files.token, files.ca, files.cert, files.key)
         return self._channel
 
     @contextlib.contextmanager
@@ -119,6 +139,11 @@ class _NativeExchange:
     def alive(self) -> bool:
         """See `Exchange`."""
         return not self._over and self._pid == os.getpid()
+
+    @property
+    def over(self) -> bool:
+        """See `Exchange`."""
+        return not self.alive
 
     def send(self, request: Any) -> None:
         """See `Exchange`."""

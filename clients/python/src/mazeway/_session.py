@@ -18,10 +18,12 @@ import numpy as np
 import numpy.typing as npt
 
 from mazeway import _arrays, _wire
+from mazeway._access import Access
 from mazeway._link import First, Link, Stepped, SteppedOne
 from mazeway._link import link as make_link
 from mazeway._transport import Transport, choose, connect
 from mazeway.errors import (
+    ConnectionLostError,
     DeadlineExceededError,
     InvalidArgumentError,
     MazewayError,
@@ -81,7 +83,7 @@ class Session:
         action_masks: bool = False,
         timeout: float = DEFAULT_TIMEOUT_SECS,
         lease_secs: float | None = None,
-        client: str = "auto",
+        access: Access | None = None,
     ) -> None:
         """Keeps what the session is made from; nothing is sent.
 
@@ -91,9 +93,9 @@ class Session:
             raise InvalidArgumentError(f"timeout: expected seconds above 0, got {timeout!r}", field="timeout")
         if num_envs < 1:
             raise InvalidArgumentError(f"num_envs: expected at least 1, got {num_envs!r}", field="num_envs")
-        choose(client)
+        self.access = access or Access()
+        choose(self.access.client)
         self.address = address
-        self.client = client
         self.timeout = timeout
         self.num_envs = num_envs
         #: True from the first seeded reset on: the server's generators may then go on by themselves.
@@ -213,7 +215,7 @@ class Session:
         try:
             return link.step(_arrays.integers(actions, (self.num_envs,), "actions"))
         except BaseException as error:  # noqa: BLE001 - raised as what it means
-            raise self._failed(error) from None
+            raise self._failed(error, stepping=True) from None
 
     def step_one(self, action: Any) -> SteppedOne:
         """As `step` in a session of one environment."""
@@ -223,7 +225,7 @@ class Session:
             if stepped is None and isinstance(action, np.ndarray) and action.size == 1:
                 stepped = link.step_one(action.item())
         except BaseException as error:  # noqa: BLE001 - raised as what it means
-            raise self._failed(error) from None
+            raise self._failed(error, stepping=True) from None
         if stepped is None:
             last = self.spec.n_actions - 1
             raise InvalidArgumentError(
@@ -243,7 +245,7 @@ class Session:
         except InvalidArgumentError:
             raise  # nothing was sent
         except BaseException as error:  # noqa: BLE001 - raised as what it means
-            raise self._failed(error) from None
+            raise self._failed(error, stepping=True) from None
         self.pending += 1
 
     def receive(self) -> Stepped:
@@ -255,7 +257,7 @@ class Session:
         try:
             return link.receive()
         except BaseException as error:  # noqa: BLE001 - raised as what it means
-            raise self._failed(error) from None
+            raise self._failed(error, stepping=True) from None
 
     def _under_way(self, what: str) -> Link:
         """The link, where an episode goes on."""
@@ -303,7 +305,7 @@ class Session:
             if self._connection.pid == os.getpid():
                 return False
             self._drop()
-        transport = connect(self.address, _wire.ENVIRONMENT_SERVICE, self.client)
+        transport = connect(self.address, _wire.ENVIRONMENT_SERVICE, self.access)
         try:
             response = transport.unary("CreateSession", self._create, timeout=self.timeout)
             link = make_link(transport, response, self.timeout)
@@ -324,10 +326,15 @@ class Session:
             self._finalizer()
             self._finalizer = None
 
-    def _failed(self, error: BaseException) -> BaseException:
-        """Takes note of a failure; returns the error to raise."""
+    def _failed(self, error: BaseException, *, stepping: bool = False) -> BaseException:
+        """Takes note of a failure, within an episode where `stepping`; returns the error to raise."""
         self.pending = 0  # whatever was under way went with the stream
         if isinstance(error, ServerUnreachableError):
+            if stepping:
+                # The session may live on, and the next reset takes it up; what its generators have drawn
+                # since the last answer is unknown.
+                self.started = self.seeded = False
+                return error if isinstance(error, ConnectionLostError) else _interrupted(error)
             self._drop()
         elif isinstance(error, (NotFoundError, DeadlineExceededError)):
             self._drop()
@@ -338,6 +345,13 @@ class Session:
             self.started = False
         # Else the stream is over; the session lives on and the next stream takes it up.
         return error
+
+
+def _interrupted(error: ServerUnreachableError) -> ConnectionLostError:
+    return ConnectionLostError(
+        f"the episode is lost: {error.message}",
+        hint=f"call reset() to begin anew; where no server is left, {error.hint or 'start one'}",
+    )
 
 
 def _lost(error: MazewayError) -> SessionLostError:

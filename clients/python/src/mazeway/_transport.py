@@ -10,11 +10,19 @@ from __future__ import annotations
 
 import importlib.util
 import os
-from collections.abc import Iterable, Iterator
-from typing import Any, Protocol
+import random
+import time
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, Protocol, TypeVar
 
 from mazeway import _wire
-from mazeway.errors import DeadlineExceededError, InvalidArgumentError, UnsupportedError
+from mazeway._access import Access
+from mazeway.errors import (
+    DeadlineExceededError,
+    InvalidArgumentError,
+    ServerUnreachableError,
+    UnsupportedError,
+)
 
 #: The command that starts each service, for hints.
 START = {
@@ -24,6 +32,30 @@ START = {
 
 #: Longest message either way; a batch or a frame beyond it is refused rather than held.
 MAX_MESSAGE_BYTES = 256 * 1024 * 1024
+
+#: How long a server that went away is waited for, at most.
+RECONNECT_SECS = 10.0
+
+#: Calls that change nothing when they are made twice: what only reads, and what is known by its content. A
+#: session that was made in vain ends with its lease.
+REPEATABLE = frozenset(
+    {
+        "Act",
+        "CreateSession",
+        "ExportTrajectories",
+        "GetFit",
+        "GetModel",
+        "ListEnvironments",
+        "ListFits",
+        "ListModels",
+        "ListTrajectories",
+        "PutModel",
+        "Render",
+        "Watch",
+    }
+)
+
+T = TypeVar("T")
 
 #: What `client` may be. "auto" is the native client where it is built and knows the kind of address.
 CLIENTS = ("auto", "native", "grpc")
@@ -39,6 +71,10 @@ class Exchange(Protocol):
     alive: bool
     #: Longest wait for an answer, in seconds.
     timeout: float
+
+    @property
+    def over(self) -> bool:
+        """Whether the stream has ended, as far as is known here: one may break while nobody looks."""
 
     def send(self, request: Any) -> None:
         """Queues a request; never blocks."""
@@ -75,23 +111,25 @@ class Transport(Protocol):
         """Frees the connection; may be called twice."""
 
 
-def connect(address: str, service: str, client: str = "auto") -> Transport:
+def connect(address: str, service: str, access: Access | None = None) -> Transport:
     """A transport to `address`; connects with the first call.
 
-    Raises InvalidArgumentError for no address or no such client, UnsupportedError for a client that is
-    not there.
+    Raises InvalidArgumentError for no address, no such client, or certificates and tokens that do not go
+    with them, UnsupportedError for a client that is not there.
     """
     target, secure = check_address(address)
-    if choose(client, secure=secure) == "native":
+    access = access or Access()
+    credentials = access.resolve(target, secure=secure)
+    if choose(access.client) == "native":
         from mazeway._native_transport import NativeTransport  # there may be none
 
-        return NativeTransport(target, service)
+        return NativeTransport(target, service, secure=secure, credentials=credentials)
     from mazeway._grpc import GrpcTransport  # the native client needs no grpcio
 
-    return GrpcTransport(target, service, secure=secure)
+    return GrpcTransport(target, service, secure=secure, credentials=credentials)
 
 
-def choose(client: str, *, secure: bool = False) -> str:
+def choose(client: str) -> str:
     """The client that is meant: "native" or "grpc"."""
     if client not in CLIENTS:
         names = ", ".join(map(repr, CLIENTS))
@@ -105,14 +143,12 @@ def choose(client: str, *, secure: bool = False) -> str:
             )
     native = has_native()
     if client == "auto":
-        return "native" if native and not secure else "grpc"
+        return "native" if native else "grpc"
     if client == "native" and not native:
         raise UnsupportedError(
             "the native client is not built",
             hint="pip install ./clients/python with a Rust toolchain at hand, or take client='grpc'",
         )
-    if client == "native" and secure:
-        raise UnsupportedError("the native client has no TLS", hint="take client='grpc'")
     return client
 
 
@@ -145,3 +181,32 @@ def late(address: str, timeout: float) -> DeadlineExceededError:
         f"no answer from {address} within {timeout:g} s",
         hint="raise `timeout`, or see whether the server is busy",
     )
+
+
+class Backoff:
+    """Growing pauses, drawn at random within their length, until it is time to give up."""
+
+    def __init__(self, within: float, first: float = 0.01, longest: float = 1.0) -> None:
+        """Takes seconds."""
+        self._deadline = time.monotonic() + within
+        self._pause, self._longest = first, longest
+
+    def pause(self) -> bool:
+        """Pauses; False where there is no time left for it."""
+        pause = self._pause * random.uniform(0.5, 1.0)
+        if time.monotonic() + pause > self._deadline:
+            return False
+        time.sleep(pause)
+        self._pause = min(2 * self._pause, self._longest)
+        return True
+
+
+def reconnecting(call: Callable[[], T], timeout: float) -> T:
+    """Calls until the server answers, within bounds."""
+    backoff = Backoff(min(RECONNECT_SECS, 0.8 * timeout))
+    while True:
+        try:
+            return call()
+        except ServerUnreachableError:
+            if not backoff.pause():
+                raise

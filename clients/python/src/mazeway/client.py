@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -11,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mazeway import _arrays, _wire
+from mazeway._access import Access
 from mazeway._session import DEFAULT_ADDRESS, DEFAULT_TIMEOUT_SECS, Session
 from mazeway._transport import connect
 from mazeway.env import check_seed, server_env_id
@@ -114,15 +116,29 @@ class Client:
         *,
         timeout: float = DEFAULT_TIMEOUT_SECS,
         client: str = "auto",
+        token: str | None = None,
+        ca: str | os.PathLike[str] | None = None,
+        cert: str | os.PathLike[str] | None = None,
+        key: str | os.PathLike[str] | None = None,
+        insecure: bool = False,
     ) -> None:
-        """Takes "host:port", the longest wait for a call in seconds, and which client to use.
+        """Describes the server; nothing is sent yet.
 
-        `client` is "native", "grpc", or "auto" for the native one where it is built.
+        Args:
+            address: "host:port" of the server, or "https://host:port".
+            timeout: Longest wait for a call, in seconds.
+            client: "native", "grpc", or "auto" for the native one where it is built.
+            token: What the service knows you by; None: MAZEWAY_TOKEN, or what MAZEWAY_TOKEN_FILE holds.
+            ca: File, in PEM, of authorities that may vouch for an https:// address instead of the
+                usual ones; None: MAZEWAY_TLS_CA.
+            cert: File, in PEM, of your own certificate; None: MAZEWAY_TLS_CERT.
+            key: File, in PEM, of its key; None: MAZEWAY_TLS_KEY.
+            insecure: True sends the token unencrypted beyond this machine.
         """
         self.address = address
         self.timeout = timeout
-        self.client = client
-        self._transport = connect(address, _wire.ENVIRONMENT_SERVICE, client)
+        self.access = Access(client, token, ca, cert, key, insecure)
+        self._transport = connect(address, _wire.ENVIRONMENT_SERVICE, self.access)
 
     def __enter__(self) -> Client:
         """Itself."""
@@ -240,7 +256,7 @@ class Client:
 
     def _sizes(self, env_id: str, options: Mapping[str, Any]) -> tuple[int, int]:
         """States and actions under the options, which may change them (a maze's layout does)."""
-        session = Session(self.address, env_id, dict(options), timeout=self.timeout, client=self.client)
+        session = Session(self.address, env_id, dict(options), timeout=self.timeout, access=self.access)
         try:
             spec = session.open()
             return spec.n_states, spec.n_actions

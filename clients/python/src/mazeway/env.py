@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import operator
+import os
 from typing import Any, SupportsFloat
 
 import gymnasium
@@ -10,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mazeway import _arrays
+from mazeway._access import Access, hidden
 from mazeway._session import DEFAULT_ADDRESS, DEFAULT_TIMEOUT_SECS, Session
 from mazeway.errors import InvalidArgumentError
 
@@ -68,6 +70,8 @@ class MazewayEnv(gymnasium.Env[Any, Any]):
         "render_fps": 5,
     }
 
+    _spec: Any = None
+
     def __init__(
         self,
         env_id: str,
@@ -79,6 +83,11 @@ class MazewayEnv(gymnasium.Env[Any, Any]):
         timeout: float = DEFAULT_TIMEOUT_SECS,
         lease_secs: float | None = None,
         client: str = "auto",
+        token: str | None = None,
+        ca: str | os.PathLike[str] | None = None,
+        cert: str | os.PathLike[str] | None = None,
+        key: str | os.PathLike[str] | None = None,
+        insecure: bool = False,
         **options: Any,
     ) -> None:
         """Describes the environment; nothing is sent yet.
@@ -93,6 +102,12 @@ class MazewayEnv(gymnasium.Env[Any, Any]):
             timeout: Longest wait for any answer, in seconds.
             lease_secs: How long the session outlives its last use; None is the server's default.
             client: "native", "grpc", or "auto" for the native one where it is built.
+            token: What the service knows you by; None: MAZEWAY_TOKEN, or what MAZEWAY_TOKEN_FILE holds.
+            ca: File, in PEM, of authorities that may vouch for an https:// address instead of the
+                usual ones; None: MAZEWAY_TLS_CA.
+            cert: File, in PEM, of your own certificate; None: MAZEWAY_TLS_CERT.
+            key: File, in PEM, of its key; None: MAZEWAY_TLS_KEY.
+            insecure: True sends the token unencrypted beyond this machine.
             **options: The environment's own options (see `mazeway.Client.list_environments`).
         """
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
@@ -102,7 +117,7 @@ class MazewayEnv(gymnasium.Env[Any, Any]):
             )
         self.env_id = server_env_id(env_id)
         self.address = address
-        self.client = client
+        self.access = Access(client, token, ca, cert, key, insecure)
         self.options = options
         self.render_mode = render_mode
         self._session = Session(
@@ -113,10 +128,22 @@ class MazewayEnv(gymnasium.Env[Any, Any]):
             action_masks=action_masks,
             timeout=timeout,
             lease_secs=lease_secs,
-            client=client,
+            access=self.access,
         )
         self._observation_space: gymnasium.Space[Any] | None = None
         self._action_space: gymnasium.spaces.Discrete | None = None
+
+    @property
+    def spec(self) -> Any:
+        """What `gymnasium.make` was given."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: Any) -> None:
+        # It shows its arguments, and a token is shown to nobody.
+        if spec is not None and spec.kwargs.get("token") is not None:
+            spec.kwargs = hidden(spec.kwargs)
+        self._spec = spec
 
     @property
     def observation_space(self) -> gymnasium.Space[Any]:  # type: ignore[override]

@@ -45,7 +45,19 @@ class DeadlineExceededError(MazewayError, TimeoutError):
     """The answer did not come within the timeout."""
 
 
-class SessionLostError(MazewayError):
+class AccessDeniedError(MazewayError, PermissionError):
+    """The service wants a token or a certificate, or another one, or the token is not good for this."""
+
+
+class EpisodeLostError(MazewayError):
+    """The episode cannot go on: nobody knows whether its last step was made. `reset` begins another."""
+
+
+class ConnectionLostError(EpisodeLostError, ServerUnreachableError):
+    """The connection broke during a step."""
+
+
+class SessionLostError(EpisodeLostError):
     """The server no longer knows the session: its lease expired or the server was restarted."""
 
 
@@ -159,6 +171,15 @@ def from_status(
         return UnsupportedError(
             f"the server at {address} does not know this method ({details})",
             hint=f"check that the address is right and the server current: {start}",
+        )
+    if name in ("unauthenticated", "permission denied"):
+        return AccessDeniedError(
+            f"{address} denies access ({details})",
+            hint="give a token that is good for this: token=, MAZEWAY_TOKEN or MAZEWAY_TOKEN_FILE",
+        )
+    if name == "aborted":
+        return ConnectionLostError(
+            details, hint=f"call reset() to begin anew; where no server is left, start one with: {start}"
         )
     kind = _KINDS.get(name)
     if kind is WrongStateError and violations and violations[0][0] == "session_id":

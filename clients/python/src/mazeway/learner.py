@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import datetime
+import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy.typing as npt
 
 from mazeway import _wire
+from mazeway._access import Access
 from mazeway._session import DEFAULT_TIMEOUT_SECS
 from mazeway._transport import connect
 from mazeway.env import server_env_id
@@ -31,14 +33,30 @@ class Learner:
         *,
         timeout: float = DEFAULT_TIMEOUT_SECS,
         client: str = "auto",
+        token: str | None = None,
+        ca: str | os.PathLike[str] | None = None,
+        cert: str | os.PathLike[str] | None = None,
+        key: str | os.PathLike[str] | None = None,
+        insecure: bool = False,
     ) -> None:
-        """Takes "host:port", the longest wait for a call other than `fit` in seconds, and a client.
+        """Describes the learner; nothing is sent yet.
 
-        `client` is "native", "grpc", or "auto" for the native one where it is built.
+        Args:
+            address: "host:port" of the learner, or "https://host:port".
+            timeout: Longest wait for a call other than `fit`, in seconds.
+            client: "native", "grpc", or "auto" for the native one where it is built.
+            token: What the service knows you by; None: MAZEWAY_TOKEN, or what MAZEWAY_TOKEN_FILE holds.
+            ca: File, in PEM, of authorities that may vouch for an https:// address instead of the
+                usual ones; None: MAZEWAY_TLS_CA.
+            cert: File, in PEM, of your own certificate; None: MAZEWAY_TLS_CERT.
+            key: File, in PEM, of its key; None: MAZEWAY_TLS_KEY.
+            insecure: True sends the token unencrypted beyond this machine.
         """
         self.address = address
         self.timeout = timeout
-        self._transport = connect(address, _wire.LEARNER_SERVICE, client)
+        self._transport = connect(
+            address, _wire.LEARNER_SERVICE, Access(client, token, ca, cert, key, insecure)
+        )
 
     def __enter__(self) -> Learner:
         """Itself."""
@@ -67,7 +85,7 @@ class Learner:
         source: str = "",
         trajectory_ids: Sequence[str] = (),
         progress: Callable[[Progress], None] | None = None,
-        timeout_secs: float = 3600.0,
+        timeout_secs: float = 600.0,
         **options: Any,
     ) -> Fit:
         """Fits a reward and a policy to the recorded demonstrations of a style.
@@ -81,7 +99,7 @@ class Learner:
             source: Only demonstrations by this source.
             trajectory_ids: Only these demonstrations.
             progress: Called after each iteration.
-            timeout_secs: Longest time for the whole fit.
+            timeout_secs: Longest time without a word from the learner; the fit itself may take longer.
             **options: discount, horizon, horizon_prior ("geometric", "uniform"), basis ("state",
                 "state-action", "features"), features (names), m_step ("nnls", "simplex"),
                 responsibility ("approximate", "exact"),
@@ -98,7 +116,7 @@ class Learner:
             options=options_to_wire(options),
         )
         _assign(request, "max_trajectories", max_trajectories)
-        for response in self._transport.responses("Fit", request, timeout=timeout_secs):
+        for response in self._transport.responses("Fit", request, timeout=timeout_secs, each=True):
             if response.WhichOneof("event") == "fit":
                 return Fit(response.fit)
             if progress is not None:

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import os
-import time
 from typing import Any, SupportsFloat
 
 import gymnasium
 import numpy as np
 
 from mazeway import _wire
+from mazeway._access import Access, Secret
 from mazeway._session import DEFAULT_TIMEOUT_SECS
-from mazeway._transport import Exchange, Transport, connect
+from mazeway._transport import Backoff, Exchange, Transport, connect
 from mazeway.client import Client
 from mazeway.env import MazewayEnv, server_env_id
 from mazeway.errors import (
@@ -25,8 +26,6 @@ from mazeway.errors import (
 from mazeway.learner import DEFAULT_LEARNER_ADDRESS, Learner
 from mazeway.model import Model
 from mazeway.trajectory import Trajectory
-
-_RETRY_SECS = 0.2
 
 
 class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordConstructorArgs):
@@ -50,6 +49,11 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordCons
         source: str = "python",
         timeout: float = DEFAULT_TIMEOUT_SECS,
         client: str = "auto",
+        token: str | None = None,
+        ca: str | os.PathLike[str] | None = None,
+        cert: str | os.PathLike[str] | None = None,
+        key: str | os.PathLike[str] | None = None,
+        insecure: bool = False,
     ) -> None:
         """Wraps an environment; nothing is sent yet.
 
@@ -64,6 +68,12 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordCons
             source: Who acts.
             timeout: Longest wait for the learner, in seconds.
             client: "native", "grpc", or "auto" for the native one where it is built.
+            token: What the learner knows you by; None: MAZEWAY_TOKEN, or what MAZEWAY_TOKEN_FILE holds.
+            ca: File, in PEM, of authorities that may vouch for an https:// address instead of the
+                usual ones; None: MAZEWAY_TLS_CA.
+            cert: File, in PEM, of your own certificate; None: MAZEWAY_TLS_CERT.
+            key: File, in PEM, of its key; None: MAZEWAY_TLS_KEY.
+            insecure: True sends the token unencrypted beyond this machine.
         """
         gymnasium.utils.RecordConstructorArgs.__init__(
             self,
@@ -74,6 +84,11 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordCons
             source=source,
             timeout=timeout,
             client=client,
+            token=None if token is None else Secret(token),
+            ca=ca,
+            cert=cert,
+            key=key,
+            insecure=insecure,
         )
         gymnasium.Wrapper.__init__(self, env)
         observations: Any = env.observation_space
@@ -92,9 +107,9 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordCons
         self.source = source
         self._n_states, self._first_state = int(observations.n), int(observations.start)
         self._n_actions, self._first_action = int(actions.n), int(actions.start)
-        self._uploader = _Uploader(address, timeout, client)
+        self._access = Access(client, token, ca, cert, key, insecure)
+        self._uploader = _Uploader(address, timeout, self._access)
         self._timeout = timeout
-        self._client = client
         self._forget()
 
     @property
@@ -174,7 +189,7 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordCons
         inner = self.env.unwrapped
         parts: Any
         if isinstance(inner, MazewayEnv):
-            client = Client(inner.address, timeout=self._timeout, client=inner.client)
+            client = Client(inner.address, timeout=self._timeout, **dataclasses.asdict(inner.access))
             parts = client.model_parts(inner.env_id, inner.options)
         elif isinstance(getattr(inner, "P", None), dict):
             client = None
@@ -185,7 +200,7 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordCons
             if client is not None:
                 stack.callback(client.close)
             learner = stack.enter_context(
-                Learner(self.learner_address, timeout=self._timeout, client=self._client)
+                Learner(self.learner_address, timeout=self._timeout, **dataclasses.asdict(self._access))
             )
             return learner.put_model_parts(list(parts))
 
@@ -201,9 +216,9 @@ def _env_id(env: gymnasium.Env[Any, Any]) -> str:
 class _Uploader:
     """Sends trajectories over one stream, and again over another where that breaks."""
 
-    def __init__(self, address: str, timeout: float, client: str) -> None:
+    def __init__(self, address: str, timeout: float, access: Access) -> None:
         self._address = address
-        self._client = client
+        self._access = access
         self._timeout = timeout
         #: Not acknowledged, in the order of sending; the learner knows a repeated id.
         self.pending: dict[str, Trajectory] = {}
@@ -225,15 +240,14 @@ class _Uploader:
 
     def flush(self) -> None:
         """Waits until nothing is pending, trying again after a failure until the timeout."""
-        deadline = time.monotonic() + self._timeout
+        backoff = Backoff(self._timeout, first=0.05)
         while self.pending:
             try:
                 self._attempt()
             except (ServerUnreachableError, DeadlineExceededError):
                 self.close()
-                if time.monotonic() + _RETRY_SECS > deadline:
+                if not backoff.pause():
                     raise
-                time.sleep(_RETRY_SECS)
             except (InvalidArgumentError, AlreadyExistsError) as error:
                 # Refused for good: a retry would fail for ever and hold back what follows.
                 self.close()
@@ -266,7 +280,7 @@ class _Uploader:
         """Waits for the answers of the present stream, or opens one and sends all that is pending."""
         if self._exchange is None or not self._exchange.alive or self._pid != os.getpid():
             self.close()
-            self._transport = connect(self._address, _wire.LEARNER_SERVICE, self._client)
+            self._transport = connect(self._address, _wire.LEARNER_SERVICE, self._access)
             self._exchange = self._transport.exchange("RecordTrajectories", timeout=self._timeout)
             self._submit(list(self.pending.values()))
         while self._in_flight:

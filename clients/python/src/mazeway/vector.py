@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import os
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy.typing as npt
 from gymnasium.vector.utils import batch_space
 
 from mazeway import _arrays
+from mazeway._access import Access, hidden
 from mazeway._link import First, Stepped
 from mazeway._session import DEFAULT_ADDRESS, DEFAULT_TIMEOUT_SECS, Session
 from mazeway.env import MazewayEnv, action_space, check_seed, refuse_options, render, server_env_id
@@ -45,6 +47,8 @@ class MazewayVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         "autoreset_mode": AutoresetMode.NEXT_STEP,
     }
 
+    _spec: Any = None
+
     def __init__(
         self,
         env_id: str,
@@ -58,6 +62,11 @@ class MazewayVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         timeout: float = DEFAULT_TIMEOUT_SECS,
         lease_secs: float | None = None,
         client: str = "auto",
+        token: str | None = None,
+        ca: str | os.PathLike[str] | None = None,
+        cert: str | os.PathLike[str] | None = None,
+        key: str | os.PathLike[str] | None = None,
+        insecure: bool = False,
         **options: Any,
     ) -> None:
         """Opens the session.
@@ -74,6 +83,12 @@ class MazewayVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             timeout: Longest wait for any answer, in seconds.
             lease_secs: How long the session outlives its last use; None is the server's default.
             client: "native", "grpc", or "auto" for the native one where it is built.
+            token: What the service knows you by; None: MAZEWAY_TOKEN, or what MAZEWAY_TOKEN_FILE holds.
+            ca: File, in PEM, of authorities that may vouch for an https:// address instead of the
+                usual ones; None: MAZEWAY_TLS_CA.
+            cert: File, in PEM, of your own certificate; None: MAZEWAY_TLS_CERT.
+            key: File, in PEM, of its key; None: MAZEWAY_TLS_KEY.
+            insecure: True sends the token unencrypted beyond this machine.
             **options: The environment's own options.
         """
         super().__init__()
@@ -85,7 +100,7 @@ class MazewayVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         self.autoreset_mode = _autoreset_mode(autoreset_mode)
         self.env_id = server_env_id(env_id)
         self.address = address
-        self.client = client
+        self.access = Access(client, token, ca, cert, key, insecure)
         self.options = options
         self.num_envs = num_envs
         self.render_mode = render_mode
@@ -99,7 +114,7 @@ class MazewayVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             action_masks=action_masks,
             timeout=timeout,
             lease_secs=lease_secs,
-            client=client,
+            access=self.access,
         )
         spec = self._session.open()
         self.metadata = {**type(self).metadata, "autoreset_mode": self.autoreset_mode}
@@ -175,6 +190,18 @@ class MazewayVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             gymnasium.logger.warn("render() was called without a render mode")
             return None
         return tuple(render(self._session, i, self.render_mode) for i in range(self.num_envs))
+
+    @property
+    def spec(self) -> Any:
+        """What `gymnasium.make_vec` was given."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: Any) -> None:
+        # It shows its arguments, and a token is shown to nobody.
+        if spec is not None and spec.kwargs.get("token") is not None:
+            spec.kwargs = hidden(spec.kwargs)
+        self._spec = spec
 
     @property
     def session_id(self) -> str:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
@@ -12,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mazeway import _arrays, _wire
+from mazeway._access import Access
 from mazeway._session import DEFAULT_ADDRESS
 from mazeway._transport import Transport, connect
 from mazeway.env import MazewayEnv
@@ -47,7 +50,12 @@ def watch(
     max_width: int = 0,
     address: str | None = None,
     timeout: float | None = None,
-    client: str = "auto",
+    client: str | None = None,
+    token: str | None = None,
+    ca: str | os.PathLike[str] | None = None,
+    cert: str | os.PathLike[str] | None = None,
+    key: str | os.PathLike[str] | None = None,
+    insecure: bool | None = None,
 ) -> Iterator[Frame]:
     """Pictures of one environment of a session: the present one, then others as it changes.
 
@@ -63,7 +71,12 @@ def watch(
         max_width: Pixels across at most, not for "ansi"; 0 is as wide as the environment draws.
         address: "host:port" of the server; None is the environment's own.
         timeout: Longest wait for a change, in seconds; None waits as long as the session lives.
-        client: "native", "grpc", or "auto" for the native one where it is built.
+        client: As for the environment; None, as for all that follows, is the environment's own.
+        token: What the server knows you by.
+        ca: File of authorities.
+        cert: File of your own certificate.
+        key: File of its key.
+        insecure: True sends the token unencrypted beyond this machine.
     """
     if mode not in MODES:
         raise InvalidArgumentError(f"mode: expected one of {MODES}, got {mode!r}", field="mode")
@@ -71,6 +84,7 @@ def watch(
         name, value = ("index", index) if index < 0 else ("max_width", max_width)
         raise InvalidArgumentError(f"{name}: expected at least 0, got {value}", field=name)
     session_id: str
+    access = Access()
     if isinstance(what, str):
         session_id, address = what, address or DEFAULT_ADDRESS
     else:
@@ -79,7 +93,11 @@ def watch(
             raise InvalidArgumentError(
                 f"what: expected an environment of Mazeway or the id of a session, got {what!r}", field="what"
             )
-        session_id, address = env.session_id, address or env.address
+        session_id, address, access = env.session_id, address or env.address, env.access
+    given = {"client": client, "token": token, "ca": ca, "cert": cert, "key": key, "insecure": insecure}
+    access = dataclasses.replace(
+        access, **{name: value for name, value in given.items() if value is not None}
+    )
     request = _wire.env.WatchRequest(
         session_id=session_id,
         index=index,
@@ -87,7 +105,7 @@ def watch(
         max_fps=max_fps,
         max_width=max_width,
     )
-    transport = connect(address, _wire.ENVIRONMENT_SERVICE, client)
+    transport = connect(address, _wire.ENVIRONMENT_SERVICE, access)
     return _frames(transport, request, mode, math.inf if timeout is None else timeout)
 
 

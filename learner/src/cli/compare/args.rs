@@ -1,6 +1,9 @@
 //! Flags of `learner compare`, as typed.
 
-use crate::cli::fit::learning::{LearningArgs, method_ids};
+use crate::cli::{
+    AccessArgs,
+    fit::learning::{LearningArgs, method_ids},
+};
 use clap::Args;
 use std::path::PathBuf;
 
@@ -66,6 +69,8 @@ pub struct CompareArgs {
     /// Address of a running environment server [default: start one]
     #[arg(long, value_name = "HOST:PORT", help_heading = "Where")]
     pub env_addr: Option<String>,
+    #[command(flatten)]
+    pub access: AccessArgs,
     /// Directory for the tables, the pictures and what is finished [default: reports/compare-ENV-STYLE in the data directory]
     #[arg(long, value_name = "DIR", help_heading = "Where")]
     pub out: Option<PathBuf>,

@@ -37,7 +37,7 @@ use std::{
 pub async fn run(args: CompareArgs) -> Result<(), CliError> {
     let job = Job::new(&args)?;
     let narrator = Narrator::new(args.json);
-    let environments = Environments::start(args.env_addr.as_deref()).await?;
+    let environments = Environments::start(args.env_addr.as_deref(), &args.access).await?;
     let outcome = async {
         let compared = compare(&job, &environments.connection, narrator, |style| {
             if let Some(out) = &args.out {

@@ -6,10 +6,10 @@ use crate::cli::{
     data_directory,
     embedded::{self, Embedded},
     error::CliError,
-    scene,
+    scene, unreachable,
 };
 use mazeway_client::{
-    Code, Connection, Env, EnvSpec, Episodes, Learner, Model, Rollout, SessionOptions, packed::Packed,
+    Code, ConnectOptions, Connection, Env, EnvSpec, Episodes, Learner, Model, Rollout, SessionOptions, packed::Packed,
 };
 use mazeway_learner::report::Source;
 use mazeway_proto::learner::{Fit, FitProgress, FitRequest, Trajectory, TrajectoryFilter};
@@ -58,13 +58,23 @@ impl Services {
                 address
             }
         };
-        let learner = Learner::connect(&learner_address).await.map_err(|error| {
-            CliError::failure(error.to_string(), format!("start one with 'learner serve --listen {learner_address}'"))
+        let access = &args.store.access;
+        // What this command has started asks for nothing.
+        let options = match &args.store.addr {
+            Some(address) => access.options(address)?,
+            None => ConnectOptions::default(),
+        };
+        let learner = Learner::connect_with(&learner_address, &options).await.map_err(|error| {
+            unreachable(&error, format!("start one with 'learner serve --listen {learner_address}'"))
         })?;
+        let options = match args.env_addr.as_ref().or(args.store.addr.as_ref()) {
+            Some(_) => access.options(&environments_address)?,
+            None => ConnectOptions::default(),
+        };
         // An imported environment needs none: it is an error only once it is asked for.
-        let environments = Connection::open(&environments_address).await.map_err(|error| {
-            CliError::failure(
-                error.to_string(),
+        let environments = Connection::connect(&environments_address, &options).await.map_err(|error| {
+            unreachable(
+                &error,
                 format!("start one with 'server --listen {environments_address}', or name another with --env-addr"),
             )
         });

@@ -6,6 +6,7 @@
 mod tables;
 
 use super::{
+    AccessArgs,
     compare::{self, CompareArgs},
     data_directory,
     error::CliError,
@@ -133,7 +134,7 @@ pub async fn run(args: ReproduceArgs) -> Result<(), CliError> {
             "choose a directory that you may write to with --out DIR",
         )
     })?;
-    let environments = Environments::start(None).await?;
+    let environments = Environments::start(None, &AccessArgs::default()).await?;
     let mut run = Run { out, environments, narrator: Narrator::new(false), text: String::new() };
     let outcome = draw(&mut run, &args).await;
     let stopped = run.environments.stop().await;

@@ -93,6 +93,17 @@ def test_same_as_sync_vector_env(pair, name, options, mode):
     assert ended >= 12, "the modes were put to the test"
 
 
+@pytest.mark.parametrize("mode", ["NEXT_STEP", "SAME_STEP"])
+def test_steps_sent_ahead_are_those_made_in_turn(pair, mode):
+    ours, theirs = pair("mazeway/Maze-v0", 4, mode, max_episode_steps=6)
+    assert_same(ours.reset(seed=3), theirs.reset(seed=3), "reset")
+    actions = [(np.arange(4) + step) % 4 for step in range(25)]
+    for action in actions:
+        ours.send(action)
+    for step, action in enumerate(actions):
+        assert_same(ours.recv(), theirs.step(action), f"step {step}")
+
+
 def test_episodes_that_end_apart(pair):
     """After masked resets at different times the environments end at different steps."""
     ours, theirs = pair("mazeway/Maze-v0", 4, "SAME_STEP", max_episode_steps=8)

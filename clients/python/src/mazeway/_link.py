@@ -237,7 +237,7 @@ class MessageLink:
 
     def close(self, timeout: float) -> None:
         """See `Link`."""
-        if self._exchange is not None and self._exchange.alive:
+        if self._exchange is not None and not self._exchange.over:
             request = _wire.env.InteractRequest()
             request.close.session_id = self._session_id
             self._exchange.timeout = timeout

@@ -64,7 +64,7 @@ mod tests {
         let begun = Instant::now();
         for _ in 0..3 {
             let short = sleep(Duration::from_millis(60));
-            assert_eq!(patience.wait(async { short.await }).await, Ok(()));
+            assert_eq!(patience.wait(short).await, Ok(()));
         }
         // The timer that the first wait armed has fired meanwhile, which ended none of them.
         assert!(begun.elapsed() >= Duration::from_millis(180));

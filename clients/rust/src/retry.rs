@@ -47,7 +47,8 @@ fn jitter() -> f64 {
 pub(crate) async fn reconnecting<T>(ask: impl AsyncFn() -> Result<T, ClientError>) -> Result<T, ClientError> {
     let mut backoff = Backoff::new(Duration::from_millis(10), Duration::from_secs(1), RECONNECT);
     loop {
-        match ask().await {
+        // Boxed: callers need not carry every call that may be tried again.
+        match Box::pin(ask()).await {
             Err(ClientError::Status { code: Code::Unavailable, message, field }) => {
                 if !backoff.pause().await {
                     return Err(ClientError::Status { code: Code::Unavailable, message, field });

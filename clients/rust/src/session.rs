@@ -315,9 +315,8 @@ impl Session {
         let outcome = self.call(Ask::Close).await;
         (self.closed, self.open) = (true, None);
         match outcome {
-            Ok(_) => Ok(()),
-            // It is gone already, which is what was wanted.
-            Err(ClientError::Status { code: Code::NotFound | Code::DeadlineExceeded, .. }) => Ok(()),
+            // Where it is gone already, that is what was wanted.
+            Ok(_) | Err(ClientError::Status { code: Code::NotFound | Code::DeadlineExceeded, .. }) => Ok(()),
             Err(error) => Err(error),
         }
     }

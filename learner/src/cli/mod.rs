@@ -178,7 +178,7 @@ pub fn main() -> ExitCode {
 
 async fn run(command: Command) -> Result<(), CliError> {
     match command {
-        Command::Fit(args) => fit::run(*args).await,
+        Command::Fit(args) => Box::pin(fit::run(*args)).await,
         Command::Compare(args) => compare::run(*args).await,
         Command::Import(args) => import::run(*args).await,
         Command::Reproduce(args) => Box::pin(reproduce::run(args)).await,

@@ -92,7 +92,7 @@ impl Run {
             self.environments.address.clone().into(),
         ];
         let args = Fit::try_parse_from(typed.chain(places)).map_err(|error| internal(&error))?.args;
-        let (report, _) = fit::make(&args, Narrator::quiet()).await?;
+        let (report, _) = Box::pin(fit::make(&args, Narrator::quiet())).await?;
         let failed = |error: mazeway_learner::report::ReportError| cannot_write(&error);
         write::write(&report, &directory).map_err(failed)?;
         Ok(report)

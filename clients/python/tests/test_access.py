@@ -1,14 +1,56 @@
-"""TLS, certificates and tokens."""
+"""TLS, certificates and tokens: a gate before the real services asks for them and passes on the rest."""
 
 import pickle
-import subprocess
+from concurrent.futures import ThreadPoolExecutor
 
+import grpc
 import gymnasium
 import pytest
 import trustme
-from conftest import binary, start_learner, start_server
 
 import mazeway
+
+TOKEN = "t0ken-of-a-robot"
+
+
+class Gate(grpc.GenericRpcHandler):
+    """Serves over TLS, and forwards the calls that bring the token."""
+
+    def __init__(self, target, directory, *, token=None, client_ca=None):
+        self._token = token
+        options = [("grpc.max_receive_message_length", -1)]
+        self._channel = grpc.insecure_channel(target, options)
+        self._server = grpc.server(ThreadPoolExecutor(16), handlers=(self,), options=options)
+        credentials = grpc.ssl_server_credentials(
+            [((directory / "server-key.pem").read_bytes(), (directory / "server.pem").read_bytes())],
+            client_ca.read_bytes() if client_ca else None,
+            require_client_auth=client_ca is not None,
+        )
+        port = self._server.add_secure_port("127.0.0.1:0", credentials)
+        self._server.start()
+        self.address = f"https://127.0.0.1:{port}"
+
+    def service(self, call):
+        """Any method: on the wire, one message is a stream of one."""
+        forward = self._channel.stream_stream(call.method)
+        given = dict(call.invocation_metadata).get("authorization")
+
+        def answer(requests, context):
+            if self._token is not None and given != f"Bearer {self._token}":
+                context.abort(grpc.StatusCode.UNAUTHENTICATED, "expected a token")
+            answers = forward(requests)
+            context.add_callback(answers.cancel)
+            try:
+                yield from answers
+            except grpc.RpcError as error:
+                context.set_trailing_metadata(error.trailing_metadata())
+                context.abort(error.code(), error.details())
+
+        return grpc.stream_stream_rpc_method_handler(answer)
+
+    def stop(self):
+        self._server.stop(None).wait()
+        self._channel.close()
 
 
 @pytest.fixture(scope="module")
@@ -27,28 +69,12 @@ def authority(tmp_path_factory):
     return directory
 
 
-def token(directory, *scopes):
-    made = subprocess.run(
-        [binary("server"), "token", "robot", "--scopes", ",".join(scopes), "--append", directory / "tokens"],
-        check=True,
-        capture_output=True,
-        text=True,
-    )
-    return made.stdout.strip()
-
-
-def tls(authority):
-    return ("--tls-cert", str(authority / "server.pem"), "--tls-key", str(authority / "server-key.pem"))
-
-
 @pytest.fixture(scope="module")
-def guarded(authority, tmp_path_factory):
+def guarded(authority, server):
     """Address of a server over TLS that asks for a token, and the token."""
-    directory = tmp_path_factory.mktemp("guarded")
-    secret = token(directory, "act", "record", "fit")
-    process = start_server(directory, *tls(authority), "--tokens", str(directory / "tokens"))
-    yield f"https://{process.address}", secret
-    process.stop()
+    gate = Gate(server, authority, token=TOKEN)
+    yield gate.address, TOKEN
+    gate.stop()
 
 
 def test_a_token_over_tls_opens_everything(guarded, authority):
@@ -108,33 +134,33 @@ def test_an_authority_that_is_not_trusted_is_none(guarded, authority, tmp_path):
         client.list_environments()
 
 
-def test_a_client_shows_its_certificate(authority, tmp_path):
-    process = start_server(tmp_path, *tls(authority), "--tls-client-ca", str(authority / "ca.pem"))
-    address, ca = f"https://{process.address}", authority / "ca.pem"
+def test_a_client_shows_its_certificate(authority, server):
+    gate = Gate(server, authority, client_ca=authority / "ca.pem")
+    address, ca = gate.address, authority / "ca.pem"
     own = {"cert": authority / "robot.pem", "key": authority / "robot-key.pem"}
     with mazeway.Client(address, ca=ca, **own) as client:
         assert client.list_environments()
     with mazeway.Client(address, ca=ca, timeout=10) as client, pytest.raises(mazeway.MazewayError):
         client.list_environments()
-    process.stop()
+    gate.stop()
 
 
-def test_a_recorder_and_a_learner_bring_their_token(guarded, authority, tmp_path):
+def test_a_recorder_and_a_learner_bring_their_token(guarded, authority, learner_address, which_client):
     address, secret = guarded
-    own = token(tmp_path, "act", "record", "fit")
-    process = start_learner(tmp_path, *tls(authority), "--tokens", str(tmp_path / "tokens"))
-    learner_address, ca = f"https://{process.address}", authority / "ca.pem"
+    own, style = "t0ken-of-a-teacher", f"guarded-{which_client}"
+    gate = Gate(learner_address, authority, token=own)
+    learner_address, ca = gate.address, authority / "ca.pem"
     env = gymnasium.make("mazeway/Maze-v0", address=address, token=secret, ca=ca, max_episode_steps=5)
-    env = mazeway.Recorder(env, "guarded", learner_address, token=own, ca=ca)
+    env = mazeway.Recorder(env, style, learner_address, token=own, ca=ca)
     env.reset(seed=1)
     for _ in range(5):
         env.step(2)
     assert own not in repr(env._saved_kwargs)
     env.close()
     with mazeway.Learner(learner_address, token=own, ca=ca) as learner:
-        assert learner.count("Maze-v0", "guarded") == 1
-        assert learner.fit("Maze-v0", "guarded", method="bc").policy.shape == (57, 4)
-    process.stop()
+        assert learner.count("Maze-v0", style) == 1
+        assert learner.fit("Maze-v0", style, method="bc").policy.shape == (57, 4)
+    gate.stop()
 
 
 @pytest.mark.parametrize(

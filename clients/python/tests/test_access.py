@@ -38,6 +38,7 @@ class Gate(grpc.GenericRpcHandler):
         def answer(requests, context):
             if self._token is not None and given != f"Bearer {self._token}":
                 context.abort(grpc.StatusCode.UNAUTHENTICATED, "expected a token")
+            context.send_initial_metadata(())  # as the services do: a stream is open before its first answer
             answers = forward(requests)
             context.add_callback(answers.cancel)
             try:

@@ -1,5 +1,6 @@
 //! Settings of the learner service: where it keeps its data, limits and times.
 
+use mazeway_serving::DoorConfig;
 use std::{path::PathBuf, time::Duration};
 
 /// Everything that a learner service can be told.
@@ -9,12 +10,14 @@ pub struct Config {
     pub data: PathBuf,
     /// What it refuses.
     pub limits: Limits,
+    /// Who is let in, and what a peer may take of the transport.
+    pub door: DoorConfig,
 }
 
 impl Config {
     /// The default limits over the data of a directory.
     pub fn new(data: impl Into<PathBuf>) -> Self {
-        Self { data: data.into(), limits: Limits::default() }
+        Self { data: data.into(), limits: Limits::default(), door: DoorConfig::default() }
     }
 }
 
@@ -23,44 +26,44 @@ impl Config {
 #[command(next_help_heading = "Limits")]
 pub struct Limits {
     /// Largest message accepted or sent, in bytes
-    #[arg(long, env = "MAZEWAY_LEARNER_MAX_MESSAGE_BYTES", default_value_t = 32 << 20, value_name = "BYTES")]
+    #[arg(long, default_value_t = 32 << 20, value_name = "BYTES")]
     pub max_message_bytes: usize,
     /// Trajectories in one request
-    #[arg(long, env = "MAZEWAY_LEARNER_MAX_TRAJECTORIES_PER_REQUEST", default_value_t = 10_000, value_name = "N")]
+    #[arg(long, default_value_t = 10_000, value_name = "N")]
     pub max_trajectories_per_request: usize,
     /// Steps of one trajectory
-    #[arg(long, env = "MAZEWAY_LEARNER_MAX_STEPS", default_value_t = 1_000_000, value_name = "N")]
+    #[arg(long, default_value_t = 1_000_000, value_name = "N")]
     pub max_steps_per_trajectory: usize,
     /// Requests of one recording stream that wait for the disk; further ones wait on the wire
-    #[arg(long, env = "MAZEWAY_LEARNER_MAX_IN_FLIGHT", default_value_t = 64, value_name = "N")]
+    #[arg(long, default_value_t = 64, value_name = "N")]
     pub max_requests_in_flight: usize,
     /// Bytes of the store in use from which recordings and models are refused; deleting, reading and fits go on [default:
     /// as many as the disk has]
-    #[arg(long, env = "MAZEWAY_LEARNER_MAX_STORE_BYTES", value_name = "BYTES")]
+    #[arg(long, value_name = "BYTES")]
     pub max_store_bytes: Option<u64>,
     /// State-action pairs of one model
-    #[arg(long, env = "MAZEWAY_LEARNER_MAX_MODEL_ROWS", default_value_t = 4_000_000, value_name = "N")]
+    #[arg(long, default_value_t = 4_000_000, value_name = "N")]
     pub max_model_rows: u64,
     /// Transitions of one model
-    #[arg(long, env = "MAZEWAY_LEARNER_MAX_MODEL_TRANSITIONS", default_value_t = 20_000_000, value_name = "N")]
+    #[arg(long, default_value_t = 20_000_000, value_name = "N")]
     pub max_model_transitions: u64,
     /// Fits that run at a time; further ones wait their turn
-    #[arg(long, env = "MAZEWAY_LEARNER_MAX_CONCURRENT_FITS", default_value_t = 2, value_name = "N")]
+    #[arg(long, default_value_t = 2, value_name = "N")]
     pub max_concurrent_fits: usize,
     /// Fits that wait their turn
-    #[arg(long, env = "MAZEWAY_LEARNER_MAX_QUEUED_FITS", default_value_t = 64, value_name = "N")]
+    #[arg(long, default_value_t = 64, value_name = "N")]
     pub max_queued_fits: usize,
     /// Iterations that a fit may ask for
-    #[arg(long, env = "MAZEWAY_LEARNER_MAX_FIT_ITERATIONS", default_value_t = 1_000_000, value_name = "N")]
+    #[arg(long, default_value_t = 1_000_000, value_name = "N")]
     pub max_fit_iterations: u32,
     /// Calls and streams of one connection at a time
-    #[arg(long, env = "MAZEWAY_LEARNER_MAX_STREAMS", default_value_t = 256, value_name = "N")]
+    #[arg(long, default_value_t = 256, value_name = "N")]
     pub max_streams_per_connection: u32,
     /// Time between HTTP/2 pings that find out whether a silent peer is still there
-    #[arg(long, env = "MAZEWAY_LEARNER_KEEPALIVE", default_value = "10s", value_parser = duration, value_name = "TIME")]
+    #[arg(long, default_value = "10s", value_parser = duration, value_name = "TIME")]
     pub keepalive: Duration,
     /// Time that running calls have to end when the service is told to stop
-    #[arg(long, env = "MAZEWAY_LEARNER_GRACE", default_value = "10s", value_parser = duration, value_name = "TIME")]
+    #[arg(long, default_value = "10s", value_parser = duration, value_name = "TIME")]
     pub shutdown_grace: Duration,
 }
 

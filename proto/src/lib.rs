@@ -4,6 +4,7 @@
 //! Packed arrays (`bytes` fields) are little-endian, row-major, without padding; the `.proto` comments give each
 //! one's element type and shape.
 
+#![forbid(unsafe_code)]
 #![allow(clippy::all, clippy::pedantic, reason = "generated code")]
 
 /// Package `mazeway`.

@@ -21,4 +21,4 @@ pub use config::Config;
 #[cfg(feature = "grpc")]
 pub use grpc::{CallError, ServeError, serve};
 #[cfg(feature = "grpc")]
-pub use mazeway_serving::{ListenAddress, Listener};
+pub use mazeway_serving::{DoorConfig, ListenAddress, Listener};

@@ -1,35 +1,49 @@
 //! The environment server's binary.
 
-use clap::Parser as _;
-use mazeway_server::{ListenAddress, Listener, config::Cli, serve};
+use clap::{CommandFactory as _, FromArgMatches as _};
+use mazeway_server::{
+    ListenAddress, Listener, ServeError,
+    config::{Cli, Command, PLACES, Settings, VARIABLES},
+    serve,
+};
+use mazeway_serving::settings::{self, SettingsError};
 use std::{
+    env,
     io::{self, Write as _},
     process::ExitCode,
 };
 use tracing_subscriber::EnvFilter;
 
 fn main() -> ExitCode {
-    let cli = match Cli::try_parse() {
-        Ok(cli) => cli,
-        Err(error) if !error.use_stderr() => {
+    let parsed = settings::parse(Cli::command(), VARIABLES, &PLACES, env::args_os());
+    let (cli, settings) = match parsed.and_then(|settings| Ok((from_matches(&settings)?, settings))) {
+        Ok(parsed) => parsed,
+        Err(SettingsError::Usage(error)) if !error.use_stderr() => {
             // Help and version; a closed pipe while printing them is nobody's failure.
             let _ = error.print();
             return ExitCode::SUCCESS;
         }
-        Err(error) => {
+        Err(SettingsError::Usage(error)) => {
             let text = error.to_string();
             let message = text.lines().next().unwrap_or_default();
             return refuse(2, message.strip_prefix("error: ").unwrap_or(message), "see 'server --help'");
         }
+        Err(error) => return refuse(2, &error.to_string(), "see what there is with 'server config'"),
+    };
+    let cli = match cli.command {
+        None => cli.settings,
+        Some(Command::Config(_)) => return print(&settings.effective()),
+        Some(Command::Token(args)) => {
+            return match args.run() {
+                Ok(text) => print(&text),
+                Err((error, hint)) => refuse(1, &error, hint),
+            };
+        }
     };
     let filter = EnvFilter::try_from_env("MAZEWAY_LOG").unwrap_or_else(|_| EnvFilter::new("warn"));
     tracing_subscriber::fmt().with_env_filter(filter).with_writer(io::stderr).init();
-    if !cli.listen.is_local() && !cli.insecure {
-        return refuse(
-            2,
-            &format!("{} is reached from other machines, and nothing on it is encrypted or authenticated", cli.listen),
-            "listen on 127.0.0.1, or add --insecure where the network is trusted",
-        );
+    if let Err((error, hint)) = cli.limits.door.check_exposed(&cli.listen, cli.insecure) {
+        return refuse(2, &error, hint);
     }
     // Connections are served by threads of their own: this one takes them in.
     let runtime = match tokio::runtime::Builder::new_current_thread().enable_all().build() {
@@ -39,7 +53,21 @@ fn main() -> ExitCode {
     runtime.block_on(run(cli))
 }
 
-async fn run(cli: Cli) -> ExitCode {
+fn from_matches(settings: &settings::Settings) -> Result<Cli, SettingsError> {
+    Cli::from_arg_matches(&settings.matches).map_err(|error| SettingsError::Usage(Box::new(error)))
+}
+
+/// Writes what was asked for. A closed pipe is not a failure: the reader has seen enough.
+fn print(text: &str) -> ExitCode {
+    match io::stdout().write_all(text.as_bytes()).and_then(|()| io::stdout().flush()) {
+        Err(error) if error.kind() != io::ErrorKind::BrokenPipe => {
+            refuse(1, &format!("could not write: {error}"), "check that the disk has room")
+        }
+        _ => ExitCode::SUCCESS,
+    }
+}
+
+async fn run(cli: Settings) -> ExitCode {
     let listener = match Listener::bind(&cli.listen).await {
         Ok(listener) => listener,
         Err(error) => {
@@ -58,8 +86,11 @@ async fn run(cli: Cli) -> ExitCode {
     let address = listener.address().unwrap_or(cli.listen);
     // Whoever started this may have closed the other end; the server serves all the same.
     let _ = writeln!(io::stdout(), "listening on {address}").and_then(|()| io::stdout().flush());
-    match serve(cli.config, listener, stop).await {
+    match serve(cli.limits, listener, stop).await {
         Ok(()) => ExitCode::SUCCESS,
+        Err(ServeError::Door(error)) => {
+            refuse(2, &error.to_string(), "see 'server --help' for what the file should hold")
+        }
         Err(error) => refuse(1, &error.to_string(), "set MAZEWAY_LOG=info to see more"),
     }
 }

@@ -69,6 +69,24 @@ impl fmt::Debug for SessionId {
     }
 }
 
+/// Who has sessions, and how much of them. Another's session is as unknown to it as one that never was.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Holder {
+    /// Its name; nobody else has it.
+    pub name: Arc<str>,
+    /// Sessions that it may have at a time; `None`: as many as the server has room for.
+    pub max_sessions: Option<usize>,
+    /// Environments that all its sessions may have.
+    pub max_envs: Option<usize>,
+}
+
+impl Holder {
+    /// Anybody, where nobody is asked who he is.
+    pub fn anybody() -> Self {
+        Self { name: "".into(), max_sessions: None, max_envs: None }
+    }
+}
+
 /// Why a session cannot be had.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum SessionError {
@@ -115,6 +133,7 @@ struct Slot {
     sight: Arc<Sight>,
     /// Pictures a second at which it looks natural.
     render_fps: u32,
+    holder: Arc<str>,
     num_envs: usize,
     lease: Duration,
     expires: Instant,
@@ -127,33 +146,44 @@ pub type OwnerHandle = Arc<dyn std::any::Any + Send + Sync>;
 struct Inner {
     slots: HashMap<SessionId, Slot>,
     total_envs: usize,
-    expired: VecDeque<SessionId>,
+    /// Sessions and environments of each holder that has any.
+    held: HashMap<Arc<str>, (usize, usize)>,
+    expired: VecDeque<(SessionId, Arc<str>)>,
 }
 
 impl Inner {
-    fn remove(&mut self, id: SessionId) {
-        if let Some(slot) = self.slots.remove(&id) {
-            self.total_envs -= slot.num_envs;
-            slot.sight.end();
+    fn remove(&mut self, id: SessionId) -> Option<Arc<str>> {
+        let slot = self.slots.remove(&id)?;
+        self.total_envs -= slot.num_envs;
+        slot.sight.end();
+        if let Some((sessions, envs)) = self.held.get_mut(&slot.holder) {
+            *sessions -= 1;
+            *envs -= slot.num_envs;
+            if *sessions == 0 {
+                self.held.remove(&slot.holder);
+            }
         }
+        Some(slot.holder)
     }
 
     fn expire(&mut self, id: SessionId) {
-        self.remove(id);
+        let Some(holder) = self.remove(id) else { return };
         if self.expired.len() == REMEMBERED_IDS {
             self.expired.pop_front();
         }
-        self.expired.push_back(id);
+        self.expired.push_back((id, holder));
     }
 
-    fn slot(&mut self, id: SessionId, now: Instant) -> Result<&mut Slot, SessionError> {
+    /// The slot of a session, if it is of `holder`; whoever asks for none was let in before.
+    fn slot(&mut self, id: SessionId, holder: Option<&str>, now: Instant) -> Result<&mut Slot, SessionError> {
+        let is_of = |of: &str| holder.is_none_or(|holder| holder == of);
         // A lease counts from the last use: what is taken is in use.
         if self.slots.get(&id).is_some_and(|slot| slot.batch.is_some() && slot.expires <= now) {
             self.expire(id);
         }
-        if self.slots.contains_key(&id) {
+        if self.slots.get(&id).is_some_and(|slot| is_of(&slot.holder)) {
             Ok(self.slots.get_mut(&id).expect("just seen"))
-        } else if self.expired.contains(&id) {
+        } else if self.expired.iter().any(|(expired, of)| *expired == id && is_of(of)) {
             Err(SessionError::Expired)
         } else {
             Err(SessionError::Unknown)
@@ -198,12 +228,13 @@ impl Sessions {
         self.len() == 0
     }
 
-    /// Creates a session of `num_envs` environments, made by `make` once the limits allow it.
+    /// Creates a session of `num_envs` environments for `holder`, made by `make` once the limits allow it.
     ///
     /// # Errors
     /// A limit, a lease out of bounds, no randomness.
     pub fn create(
         &self,
+        holder: &Holder,
         num_envs: usize,
         lease: Option<Duration>,
         now: Instant,
@@ -232,9 +263,18 @@ impl Sessions {
                 max_total_envs,
                 inner.total_envs.saturating_add(num_envs),
             )?;
+            let (sessions, envs) = inner.held.get(&holder.name).copied().unwrap_or_default();
+            if let Some(max) = holder.max_sessions {
+                limit("sessions", "sessions of this caller", max, sessions + 1)?;
+            }
+            if let Some(max) = holder.max_envs {
+                limit("num_envs", "environments of this caller", max, envs.saturating_add(num_envs))?;
+            }
             inner.total_envs += num_envs;
-            let (sight, expires) = (Arc::default(), now + lease);
-            inner.slots.insert(id, Slot { batch: None, owner: None, sight, render_fps: 1, num_envs, lease, expires });
+            inner.held.insert(Arc::clone(&holder.name), (sessions + 1, envs + num_envs));
+            let (sight, holder, expires) = (Arc::default(), Arc::clone(&holder.name), now + lease);
+            let slot = Slot { batch: None, owner: None, sight, render_fps: 1, holder, num_envs, lease, expires };
+            inner.slots.insert(id, slot);
         }
         // The slot is reserved: the batch, which may be large, is made without the lock. Should that panic, the slot goes.
         let reserved = Reserved { sessions: self, id };
@@ -247,33 +287,34 @@ impl Sessions {
         Ok((id, lease))
     }
 
-    /// Takes the batch out of its slot until the guard is dropped. `owner` lets others reach the taker, through
-    /// [`Self::owner`].
+    /// Takes the batch of a session of `holder` out of its slot until the guard is dropped. `owner` lets others reach the
+    /// taker, through [`Self::owner`].
     ///
     /// # Errors
-    /// Unknown, expired or in use.
+    /// Unknown to this holder, expired or in use.
     pub fn take(
         self: &Arc<Self>,
         id: SessionId,
+        holder: &str,
         now: Instant,
         owner: Option<OwnerHandle>,
     ) -> Result<Guard, SessionError> {
         let mut inner = self.lock();
-        let slot = inner.slot(id, now)?;
+        let slot = inner.slot(id, Some(holder), now)?;
         let batch = slot.batch.take().ok_or(SessionError::Busy)?;
         slot.owner = owner;
         let (lease, sight) = (slot.lease, Arc::clone(&slot.sight));
         Ok(Guard { sessions: Arc::clone(self), id, lease, sight, batch: Some(batch) })
     }
 
-    /// Leaves a wish to see a session, granted at once where nobody has taken it, else by its taker. Looking is no use of it:
+    /// Leaves a wish to see a session, for somebody who may ([`Self::render_fps`] says so), granted at once where nobody has taken it, else by its taker. Looking is no use of it:
     /// its lease runs on.
     ///
     /// # Errors
     /// Unknown or expired.
     pub fn look(&self, id: SessionId, now: Instant, wish: Wish) -> Result<(), SessionError> {
         let mut inner = self.lock();
-        let slot = inner.slot(id, now)?;
+        let slot = inner.slot(id, None, now)?;
         slot.sight.wish(wish);
         if let Some(batch) = &slot.batch {
             slot.sight.show(&**batch);
@@ -281,12 +322,12 @@ impl Sessions {
         Ok(())
     }
 
-    /// Pictures a second at which a session looks natural.
+    /// Pictures a second at which a session of `holder` looks natural.
     ///
     /// # Errors
-    /// Unknown or expired.
-    pub fn render_fps(&self, id: SessionId, now: Instant) -> Result<u32, SessionError> {
-        Ok(self.lock().slot(id, now)?.render_fps)
+    /// Unknown to this holder, or expired.
+    pub fn render_fps(&self, id: SessionId, holder: &str, now: Instant) -> Result<u32, SessionError> {
+        Ok(self.lock().slot(id, Some(holder), now)?.render_fps)
     }
 
     /// What the present taker of a session left to be reached by; `None` where nobody has taken it or left nothing.

@@ -3,7 +3,7 @@
 use mazeway_server::{
     batch::{Autoreset, BatchOptions},
     registry::Registry,
-    sessions::{Limits, Sessions},
+    sessions::{Holder, Limits, Sessions},
 };
 use serde_json::{Value, json};
 use std::time::{Duration, Instant};
@@ -26,7 +26,7 @@ fn session_bytes(env_id: &str, given: Value, num_envs: usize, autoreset: Autores
     let create = || {
         let environment = registry.configure(env_id, given.as_object().expect("an object")).expect("valid options");
         let make = || environment.batch(options(num_envs, autoreset));
-        sessions.create(num_envs, None, Instant::now(), make).expect("a session");
+        sessions.create(&Holder::anybody(), num_envs, None, Instant::now(), make).expect("a session");
     };
     // The first makes what all share.
     create();

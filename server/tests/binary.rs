@@ -49,7 +49,8 @@ fn it_says_where_it_listens_and_ends_on_a_signal() {
 
 #[test]
 fn settings_come_from_the_environment_too() {
-    let (mut child, address) = start(server(&[]).env("MAZEWAY_LISTEN", "127.0.0.1:0").env("MAZEWAY_MAX_SESSIONS", "3"));
+    let (mut child, address) =
+        start(server(&[]).env("MAZEWAY_SERVER_LISTEN", "127.0.0.1:0").env("MAZEWAY_SERVER_MAX_SESSIONS", "3"));
     TcpStream::connect(address).expect("it listens there");
     child.kill().expect("ends");
     child.wait().expect("ends");

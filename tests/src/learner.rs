@@ -3,6 +3,7 @@
 use mazeway_client::{Learner, packed::pack};
 use mazeway_learner::{Config, config::Limits};
 use mazeway_proto::learner as pb;
+use mazeway_server::{ListenAddress, Listener};
 use std::{net::SocketAddr, path::Path, thread::JoinHandle, time::Duration};
 use tokio::sync::oneshot;
 use uuid::Uuid;
@@ -10,7 +11,7 @@ use uuid::Uuid;
 /// A learner service on a thread and a runtime of its own, over a directory that outlives it.
 #[derive(Debug)]
 pub struct LearnerServer {
-    address: SocketAddr,
+    address: ListenAddress,
     stop: Option<oneshot::Sender<()>>,
     thread: Option<JoinHandle<()>>,
 }
@@ -31,15 +32,22 @@ impl LearnerServer {
     /// # Panics
     /// The port cannot be bound.
     pub fn at(address: SocketAddr, data: &Path, limits: Limits) -> Self {
+        let limits = Limits { shutdown_grace: limits.shutdown_grace.min(Duration::from_secs(2)), ..limits };
+        Self::configured(address.into(), Config { limits, ..Config::new(data) })
+    }
+
+    /// Starts a service on an address with all its settings.
+    ///
+    /// # Panics
+    /// The port cannot be bound.
+    pub fn configured(address: ListenAddress, config: Config) -> Self {
         let (stop, stopped) = oneshot::channel();
         let (bound, is_bound) = std::sync::mpsc::channel();
-        let limits = Limits { shutdown_grace: limits.shutdown_grace.min(Duration::from_secs(2)), ..limits };
-        let config = Config { data: data.to_owned(), limits };
         let thread = std::thread::spawn(move || {
             let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build();
             runtime.expect("a runtime").block_on(async move {
-                let listener = tokio::net::TcpListener::bind(address).await.expect("a port");
-                bound.send(listener.local_addr().expect("an address")).expect("the test waits");
+                let listener = Listener::bind(&address).await.expect("a port");
+                bound.send(listener.address().expect("an address")).expect("the test waits");
                 let shutdown = async {
                     let _ = stopped.await;
                 };
@@ -51,8 +59,14 @@ impl LearnerServer {
     }
 
     /// Where it listens.
+    ///
+    /// # Panics
+    /// On a Unix socket.
     pub fn socket(&self) -> SocketAddr {
-        self.address
+        match self.address {
+            ListenAddress::Tcp(address) => address,
+            ListenAddress::Unix(_) => panic!("expected a service on TCP"),
+        }
     }
 
     /// Where it listens, for clients.

@@ -1,5 +1,6 @@
 //! What Mazeway's end-to-end tests share: real servers on free ports of the loopback interface, shut down on drop.
 
+pub mod authority;
 pub mod crash;
 pub mod faces;
 pub mod fuzz;

@@ -6,6 +6,7 @@ use mazeway_client::{
 };
 use mazeway_proto::env::{self as pb, environment_service_client::EnvironmentServiceClient, interact_request::Request};
 use mazeway_server::Config;
+use mazeway_serving::DoorConfig;
 use mazeway_tests::{EnvServer, config, proxy::Proxy};
 use std::time::Duration;
 use tokio::{sync::mpsc, time::sleep};
@@ -199,7 +200,8 @@ async fn limits_are_kept() {
 
 #[tokio::test]
 async fn connections_are_limited_and_come_free() {
-    let server = EnvServer::with(Config { max_connections: 2, ..config() });
+    let server =
+        EnvServer::with(Config { door: DoorConfig { max_connections: 2, ..DoorConfig::default() }, ..config() });
     let (first, second) = (service(&server).await, service(&server).await);
     for mut service in [first.clone(), second.clone()] {
         service.list_environments(pb::ListEnvironmentsRequest {}).await.expect("answers");

@@ -93,6 +93,7 @@ impl From<StoreError> for CliError {
             StoreError::QuotaReached { .. } => {
                 "delete recordings with 'learner delete', or raise --max-store-bytes where the service is started"
             }
+            StoreError::AllowanceSpent { .. } => "raise max_recorded_bytes of the caller's token",
             StoreError::Busy { .. } => "stop the other program, or use another directory with --data DIR",
             StoreError::Corrupt { .. } => {
                 "see what is damaged with 'learner verify'; 'learner repair' takes over what is sound"
@@ -111,9 +112,10 @@ impl From<ServeError> for CliError {
     fn from(error: ServeError) -> Self {
         match error {
             ServeError::Store(error) => error.into(),
-            ServeError::Transport(_) | ServeError::Reflection(_) => {
-                Self::failure(error.to_string(), "set RUST_LOG=info to see more")
+            ServeError::Door(error) => {
+                Self::usage(error.to_string(), "see 'learner serve --help' for what the file should hold")
             }
+            ServeError::Reflection(_) => Self::failure(error.to_string(), "set RUST_LOG=info to see more"),
         }
     }
 }

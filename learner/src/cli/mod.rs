@@ -19,10 +19,14 @@ mod serve;
 mod show;
 mod table;
 
-use clap::{Args, CommandFactory as _, Parser, Subcommand};
+use clap::{Args, CommandFactory as _, FromArgMatches as _, Parser, Subcommand};
 use directories::ProjectDirs;
 use error::CliError;
 use mazeway_client::{ClientError, ConnectFiles, ConnectOptions};
+use mazeway_serving::{
+    settings::{self, Settings, SettingsError},
+    token_command::TokenArgs,
+};
 use std::{path::PathBuf, process::ExitCode, time::Duration};
 use tracing_subscriber::EnvFilter;
 
@@ -61,7 +65,11 @@ enum Command {
     /// Give the room that deleting has left back to the disk
     Vacuum(maintain::MaintainArgs),
     /// Run the learner service
-    Serve(serve::ServeArgs),
+    Serve(Box<serve::ServeArgs>),
+    /// Print the configuration of the learner service as a file, with where each value comes from; takes the flags of serve
+    Config(Box<serve::ServeArgs>),
+    /// Make a token for the --tokens of a service, and show its secret once
+    Token(TokenArgs),
 }
 
 /// Which recordings and fits a command works on.
@@ -151,9 +159,11 @@ pub fn data_directory(asked: Option<PathBuf>) -> Result<PathBuf, CliError> {
 
 /// Parses the arguments, runs the command and says how it went.
 pub fn main() -> ExitCode {
-    let cli = match Cli::try_parse() {
-        Ok(cli) => cli,
-        Err(error) => return error::report_usage(&error),
+    let parsed = settings::parse(Cli::command(), serve::VARIABLES, &serve::PLACES, std::env::args_os());
+    let (cli, settings) = match parsed.and_then(|settings| Ok((from_matches(&settings)?, settings))) {
+        Ok(parsed) => parsed,
+        Err(SettingsError::Usage(error)) => return error::report_usage(&error),
+        Err(error) => return CliError::usage(error.to_string(), "see what there is with 'learner config'").report(),
     };
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("error"));
     tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
@@ -167,7 +177,7 @@ pub fn main() -> ExitCode {
             .report();
         }
     };
-    let outcome = runtime.block_on(run(cli.command));
+    let outcome = runtime.block_on(run(cli.command, &settings));
     // A fit that was cut off ends at its next iteration; nobody waits for it.
     runtime.shutdown_timeout(Duration::from_secs(2));
     match outcome {
@@ -176,7 +186,11 @@ pub fn main() -> ExitCode {
     }
 }
 
-async fn run(command: Command) -> Result<(), CliError> {
+fn from_matches(settings: &Settings) -> Result<Cli, SettingsError> {
+    Cli::from_arg_matches(&settings.matches).map_err(|error| SettingsError::Usage(Box::new(error)))
+}
+
+async fn run(command: Command, settings: &Settings) -> Result<(), CliError> {
     match command {
         Command::Fit(args) => Box::pin(fit::run(*args)).await,
         Command::Compare(args) => compare::run(*args).await,
@@ -190,6 +204,8 @@ async fn run(command: Command) -> Result<(), CliError> {
         Command::Repair(args) => maintain::repair(args).await,
         Command::Backup(args) => maintain::backup(args).await,
         Command::Vacuum(args) => maintain::vacuum(args).await,
-        Command::Serve(args) => serve::run(args).await,
+        Command::Serve(args) => serve::run(*args).await,
+        Command::Config(_) => serve::print(&settings.effective()),
+        Command::Token(args) => serve::token(&args),
     }
 }

@@ -3,48 +3,76 @@
 use super::{data_directory, error::CliError};
 use clap::Args;
 use mazeway_learner::{Config, config::Limits, store::Store};
-use std::{io::Write as _, net::SocketAddr, path::PathBuf};
-use tokio::net::TcpListener;
+use mazeway_serving::{DoorConfig, ListenAddress, Listener, token_command::TokenArgs};
+use std::{io::Write as _, path::PathBuf};
 
 /// Where to listen, and on what data.
 #[derive(Debug, Args)]
+#[command(
+    after_help = "Every flag is also a variable, MAZEWAY_LEARNER_ and its name in capitals (--data: MAZEWAY_DATA), \
+    and a key of the file of --config: a flag wins over the variable, the variable over the file."
+)]
 pub struct ServeArgs {
-    /// Address to listen on; port 0 takes a free one. One line with the address goes to standard output
-    #[arg(long, env = "MAZEWAY_LEARNER_LISTEN", default_value = "127.0.0.1:50052", value_name = "HOST:PORT")]
-    listen: SocketAddr,
+    /// File of settings, in TOML, each under the name of its flag
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// Address to listen on, or unix:PATH for a Unix socket that its owner alone may use; port 0 takes a free one. One line
+    /// with the address goes to standard output
+    #[arg(long, default_value = "127.0.0.1:50052", value_name = "ADDR")]
+    listen: ListenAddress,
     /// Directory of the recordings, models and fits [default: the platform's data directory]
     #[arg(long, value_name = "DIR", env = "MAZEWAY_DATA")]
     data: Option<PathBuf>,
-    /// Listen on an address that other machines reach, although nothing is encrypted and nobody is asked who they are
-    #[arg(long, env = "MAZEWAY_INSECURE")]
+    /// Listen on an address that other machines reach, although not everything is encrypted and everybody asked who they
+    /// are
+    #[arg(long)]
     insecure: bool,
     #[command(flatten)]
     limits: Limits,
+    #[command(flatten)]
+    door: DoorConfig,
+}
+
+/// What begins the name of every variable: `MAZEWAY_LEARNER_MAX_QUEUED_FITS` is `--max-queued-fits`.
+pub const VARIABLES: &str = "MAZEWAY_LEARNER_";
+
+/// Where the settings are among the commands.
+pub const PLACES: [Option<&str>; 2] = [Some("serve"), Some("config")];
+
+/// Makes a token, and shows its secret.
+pub fn token(args: &TokenArgs) -> Result<(), CliError> {
+    let text = args.run().map_err(|(error, hint)| CliError::failure(error, hint))?;
+    print(&text)
+}
+
+/// Writes what was asked for.
+pub fn print(text: &str) -> Result<(), CliError> {
+    let mut out = std::io::stdout();
+    Ok(out.write_all(text.as_bytes()).and_then(|()| out.flush())?)
 }
 
 /// Serves until SIGINT or SIGTERM, then lets running calls end.
 pub async fn run(args: ServeArgs) -> Result<(), CliError> {
-    let ServeArgs { listen, data, insecure, limits } = args;
-    if !listen.ip().is_loopback() && !insecure {
-        return Err(CliError::usage(
-            format!("{listen} is reached from other machines, and nothing on it is encrypted or authenticated"),
-            "listen on 127.0.0.1, or add --insecure where the network is trusted",
-        ));
-    }
+    let ServeArgs { config: _, listen, data, insecure, limits, door } = args;
+    door.check_exposed(&listen, insecure).map_err(|(error, hint)| CliError::usage(error, hint))?;
     let data = data_directory(data)?;
     // A directory that cannot be used is said before the address is: who reads the line may connect.
     drop(Store::open(&data)?);
     let cannot = |error: std::io::Error| {
-        CliError::failure(format!("cannot listen on {listen}: {error}"), "take a free port: --listen 127.0.0.1:0")
+        let hint = match &listen {
+            ListenAddress::Tcp(_) => "take a free port: --listen 127.0.0.1:0",
+            ListenAddress::Unix(_) => "take a short path that is free, in a directory of yours",
+        };
+        CliError::failure(format!("cannot listen on {listen}: {error}"), hint)
     };
     let no_signals =
         |error| CliError::failure(format!("cannot watch for signals: {error}"), "raise the limit on open files");
     let stopped = stop_signal().map_err(no_signals)?;
-    let listener = TcpListener::bind(listen).await.map_err(cannot)?;
-    let address = listener.local_addr().map_err(cannot)?;
+    let listener = Listener::bind(&listen).await.map_err(cannot)?;
+    let address = listener.address().map_err(cannot)?;
     // Whoever started this may have closed the other end; the service serves all the same.
     let _ = writeln!(std::io::stdout(), "listening on {address}").and_then(|()| std::io::stdout().flush());
-    mazeway_learner::serve(Config { data, limits }, listener, stopped).await?;
+    mazeway_learner::serve(Config { data, limits, door }, listener, stopped).await?;
     Ok(())
 }
 

@@ -9,6 +9,7 @@ mod from_proto;
 mod models;
 mod options;
 mod record;
+mod rules;
 mod serve;
 mod service;
 mod status;

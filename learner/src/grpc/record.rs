@@ -4,7 +4,7 @@
 use super::{blocking, from_proto, status::CallError};
 use crate::{
     config::Limits,
-    store::{Pending, Recording, Store},
+    store::{Allowance, Pending, Recording, Store},
 };
 use futures_util::{Stream, StreamExt as _};
 use mazeway_proto::learner as pb;
@@ -26,6 +26,7 @@ struct Queued {
 /// Reads requests until the caller has no more, errs or goes, or the service stops.
 pub fn record(
     store: Store,
+    allowance: Option<Allowance>,
     limits: Arc<Limits>,
     mut requests: Streaming<pb::RecordTrajectoriesRequest>,
     stopping: CancellationToken,
@@ -41,7 +42,7 @@ pub fn record(
                 () = queue.closed() => return,
             };
             let outcome = match request {
-                Ok(Some(request)) => enqueue(&store, &limits, request).await,
+                Ok(Some(request)) => enqueue(&store, allowance.clone(), &limits, request).await,
                 Ok(None) => return,
                 Err(status) => Err(status.into()),
             };
@@ -61,6 +62,7 @@ pub fn record(
 
 async fn enqueue(
     store: &Store,
+    allowance: Option<Allowance>,
     limits: &Arc<Limits>,
     request: pb::RecordTrajectoriesRequest,
 ) -> Result<Queued, CallError> {
@@ -72,5 +74,5 @@ async fn enqueue(
         blocking(move || from_proto::recordings(request, &limits)).await?
     };
     let trajectory_ids = recordings.iter().map(|recording| recording.id().to_string()).collect();
-    Ok(Queued { trajectory_ids, stored: store.queue_recordings(recordings).await? })
+    Ok(Queued { trajectory_ids, stored: store.queue_recordings_of(allowance, recordings).await? })
 }

@@ -1,20 +1,26 @@
 //! A learner service from a listener to its shutdown.
 
-use super::service::LearnerGrpc;
+use super::{rules::rule, service::LearnerGrpc};
 use crate::{
     config::Config,
     store::{Store, StoreError, StoreOptions},
 };
 use mazeway_proto::learner::learner_service_server::LearnerServiceServer;
-use std::{future::Future, time::Duration};
-use tokio::{net::TcpListener, task::spawn_blocking, time::timeout};
-use tokio_util::sync::CancellationToken;
-use tonic::transport::{Server, server::TcpIncoming};
+use mazeway_serving::{
+    DoorError, Listener,
+    connections::Gate,
+    door::Door,
+    transport::{Transport, Wire},
+};
+use std::{future::Future, sync::Arc};
+use tokio::task::spawn_blocking;
+use tokio_util::{sync::CancellationToken, task::TaskTracker};
+use tonic::service::Routes;
 
 /// Bytes of a stream, or of all streams of a connection, that may be under way.
 const WINDOW_BYTES: u32 = 4 << 20;
-/// Time that a peer has to answer a ping.
-const PING_TIMEOUT: Duration = Duration::from_secs(10);
+/// Largest frame taken in.
+const FRAME_BYTES: u32 = 64 << 10;
 
 /// Why a service could not begin or go on.
 #[derive(Debug, thiserror::Error)]
@@ -22,9 +28,9 @@ pub enum ServeError {
     /// The store does not open.
     #[error(transparent)]
     Store(#[from] StoreError),
-    /// The transport failed.
-    #[error("the transport failed: {0}")]
-    Transport(#[from] tonic::transport::Error),
+    /// A certificate, a key or the file of tokens does not serve.
+    #[error(transparent)]
+    Door(#[from] DoorError),
     /// The descriptors of the protocol cannot be read.
     #[error("server reflection cannot read the descriptors: {0}")]
     Reflection(#[from] tonic_reflection::server::Error),
@@ -37,17 +43,19 @@ pub enum ServeError {
 /// [`Limits::shutdown_grace`]: crate::config::Limits::shutdown_grace
 ///
 /// # Errors
-/// The store does not open; the transport fails.
+/// The store does not open; the settings of the door cannot be followed.
 pub async fn serve(
     config: Config,
-    listener: TcpListener,
+    listener: impl Into<Listener>,
     shutdown: impl Future<Output = ()>,
 ) -> Result<(), ServeError> {
+    let door = Arc::new(Door::new(&config.door, rule)?);
+    let gate = Gate::new(listener.into(), config.door.max_connections);
     let data = config.data.clone();
     let options = StoreOptions { max_bytes: config.limits.max_store_bytes, ..StoreOptions::default() };
     let opening = spawn_blocking(move || Store::open_with(&data, options));
     let store = opening.await.unwrap_or(Err(StoreError::Closed))?;
-    let outcome = serve_store(config, store.clone(), listener, shutdown).await;
+    let outcome = serve_store(config, store.clone(), door, gate, shutdown).await;
     // The last clone waits for the writer.
     let _ = spawn_blocking(move || drop(store)).await;
     outcome
@@ -56,7 +64,8 @@ pub async fn serve(
 async fn serve_store(
     config: Config,
     store: Store,
-    listener: TcpListener,
+    door: Arc<Door>,
+    gate: Gate,
     shutdown: impl Future<Output = ()>,
 ) -> Result<(), ServeError> {
     let (stopping, aborting) = (CancellationToken::new(), CancellationToken::new());
@@ -64,12 +73,13 @@ async fn serve_store(
     let _guards = (stopping.clone().drop_guard(), aborting.clone().drop_guard());
     let limits = config.limits;
     let grace = limits.shutdown_grace;
-    let mut builder = Server::builder()
-        .http2_keepalive_interval(Some(limits.keepalive))
-        .http2_keepalive_timeout(Some(PING_TIMEOUT))
-        .initial_stream_window_size(WINDOW_BYTES)
-        .initial_connection_window_size(WINDOW_BYTES)
-        .max_concurrent_streams(limits.max_streams_per_connection);
+    let wire = Wire {
+        keepalive: limits.keepalive,
+        max_streams: limits.max_streams_per_connection,
+        stream_window_bytes: WINDOW_BYTES,
+        connection_window_bytes: WINDOW_BYTES,
+        frame_bytes: FRAME_BYTES,
+    };
     let max_message_bytes = limits.max_message_bytes;
     // What is sent is bounded by what was accepted: a fit's arrays by its model, a page of trajectories by its size.
     let learner = LearnerServiceServer::new(LearnerGrpc::new(store, limits, stopping.clone(), aborting))
@@ -81,21 +91,29 @@ async fn serve_store(
             .register_encoded_file_descriptor_set(mazeway_proto::FILE_DESCRIPTOR_SET)
             .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
     };
-    let router = builder
-        .add_service(learner)
+    let routes = Routes::new(learner)
         .add_service(health_service)
         .add_service(reflection().build_v1()?)
         .add_service(reflection().build_v1alpha()?);
-    let incoming = TcpIncoming::from(listener).with_nodelay(Some(true));
-    let serving = router.serve_with_incoming_shutdown(incoming, stopping.clone().cancelled_owned());
-    tokio::pin!(serving);
-    tokio::select! {
-        outcome = &mut serving => Ok(outcome?),
-        () = shutdown => {
-            health.set_not_serving::<LearnerServiceServer<LearnerGrpc>>().await;
-            stopping.cancel();
-            // Calls that need longer are cut off.
-            Ok(timeout(grace, serving).await.unwrap_or(Ok(()))?)
+    let transport = Transport::new(&config.door, wire, Arc::clone(&door), routes)?;
+    let connections = TaskTracker::new();
+    let take_in = async {
+        loop {
+            let (accepted, place) = gate.next().await;
+            let (transport, stopping) = (transport.clone(), stopping.clone());
+            connections.spawn(async move { transport.serve(accepted, place, &stopping, grace).await });
         }
+    };
+    tokio::select! {
+        () = take_in => {}
+        () = door.guard() => {}
+        () = shutdown => {}
     }
+    health.set_not_serving::<LearnerServiceServer<LearnerGrpc>>().await;
+    // Nobody is let in any more, and a Unix socket is gone, before running calls are waited for.
+    drop(gate);
+    stopping.cancel();
+    connections.close();
+    connections.wait().await;
+    Ok(())
 }

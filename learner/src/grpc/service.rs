@@ -12,10 +12,11 @@ use super::{
 };
 use crate::{
     config::Limits,
-    store::{Put, Store, check_model_id},
+    store::{Allowance, Put, Store, check_model_id},
 };
 use futures_util::Stream;
 use mazeway_proto::learner::{self as pb, learner_service_server::LearnerService};
+use mazeway_serving::Caller;
 use std::{pin::Pin, sync::Arc};
 use tokio::sync::{Semaphore, mpsc};
 use tokio_stream::wrappers::ReceiverStream;
@@ -61,6 +62,12 @@ impl LearnerGrpc {
     }
 }
 
+/// At whose expense a caller records; nobody's where nobody is asked who he is.
+fn allowance(caller: &Caller) -> Option<Allowance> {
+    let name = Some(caller.name()).filter(|name| !name.is_empty());
+    name.map(|name| Allowance { caller: name.into(), max_bytes: caller.quotas().max_recorded_bytes })
+}
+
 #[tonic::async_trait]
 impl LearnerService for LearnerGrpc {
     type RecordTrajectoriesStream = BoxStream<pb::RecordTrajectoriesResponse>;
@@ -73,7 +80,8 @@ impl LearnerService for LearnerGrpc {
         request: Request<Streaming<pb::RecordTrajectoriesRequest>>,
     ) -> Result<Response<Self::RecordTrajectoriesStream>, Status> {
         let (store, limits) = (self.store.clone(), Arc::clone(&self.limits));
-        let stream = record::record(store, limits, request.into_inner(), self.stopping.clone());
+        let allowance = allowance(&Caller::of(&request));
+        let stream = record::record(store, allowance, limits, request.into_inner(), self.stopping.clone());
         Ok(Response::new(Box::pin(stream)))
     }
 
@@ -81,6 +89,7 @@ impl LearnerService for LearnerGrpc {
         &self,
         request: Request<Streaming<pb::PutModelRequest>>,
     ) -> Result<Response<pb::PutModelResponse>, Status> {
+        let allowance = allowance(&Caller::of(&request));
         let _permit = self.models.acquire().await.map_err(|_| CallError::ShuttingDown)?;
         let mut parts = request.into_inner();
         let mut builder = ModelBuilder::default();
@@ -91,7 +100,7 @@ impl LearnerService for LearnerGrpc {
         }
         let model = blocking(move || builder.finish()).await?;
         let model_id = model.model_id().to_owned();
-        let put = self.store.put_model(model, replace.unwrap_or(false)).await.map_err(CallError::from)?;
+        let put = self.store.put_model_of(allowance, model, replace.unwrap_or(false)).await.map_err(CallError::from)?;
         Ok(Response::new(pb::PutModelResponse { model_id, already_stored: put == Put::Known }))
     }
 

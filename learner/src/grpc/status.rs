@@ -1,6 +1,7 @@
 //! One enum of everything that can be wrong with a call, and one exhaustive map from it to gRPC statuses.
 
 use crate::store::{FieldError, StoreError};
+use mazeway_serving::incident;
 use tonic::{Code, Status};
 use tonic_types::{ErrorDetails, StatusExt as _};
 
@@ -78,7 +79,7 @@ impl From<Status> for CallError {
 
 impl From<CallError> for Status {
     fn from(error: CallError) -> Self {
-        let message = error.to_string();
+        let message = told(&error);
         let mut details = ErrorDetails::new();
         let code = match &error {
             CallError::Field(error) => {
@@ -103,11 +104,32 @@ impl From<CallError> for Status {
             CallError::Transport(status) => return (**status).clone(),
             CallError::Internal(_) => Code::Internal,
         };
-        if matches!(code, Code::Internal | Code::DataLoss) {
-            tracing::error!(%message, "a call failed through no fault of its caller");
-        }
         Self::with_error_details(code, message, details)
     }
+}
+
+/// What a caller is told of an error: what it did wrong in full, and of what went wrong inside no more than that, and the
+/// number under which the log has the rest. Paths and the words of the operating system stay here.
+fn told(error: &CallError) -> String {
+    let kept = match error {
+        CallError::Store(StoreError::DiskFull { .. }) => "the disk that holds the store is full",
+        CallError::Store(StoreError::Busy { .. }) => "the store is locked by another process",
+        CallError::Store(
+            StoreError::Directory { .. }
+            | StoreError::NewerSchema { .. }
+            | StoreError::Foreign { .. }
+            | StoreError::Database { .. },
+        ) => "the store failed",
+        CallError::Internal(_) => "internal error",
+        CallError::Store(StoreError::Corrupt { .. }) => {
+            tracing::error!(%error, "a call failed through no fault of its caller");
+            return error.to_string();
+        }
+        _ => return error.to_string(),
+    };
+    let incident = incident();
+    tracing::error!(%error, incident, "a call failed through no fault of its caller");
+    format!("{kept}; the service's log has more under incident {incident}")
 }
 
 fn store_code(error: &StoreError, message: &str, details: &mut ErrorDetails) -> Code {
@@ -132,11 +154,42 @@ fn store_code(error: &StoreError, message: &str, details: &mut ErrorDetails) -> 
             details.add_quota_failure_violation("max_store_bytes", message);
             Code::ResourceExhausted
         }
+        StoreError::AllowanceSpent { .. } => {
+            details.add_quota_failure_violation("max_recorded_bytes", message);
+            Code::ResourceExhausted
+        }
         StoreError::Busy { .. } | StoreError::Closed => Code::Unavailable,
         StoreError::Corrupt { .. } => Code::DataLoss,
         StoreError::Directory { .. }
         | StoreError::NewerSchema { .. }
         | StoreError::Foreign { .. }
         | StoreError::Database { .. } => Code::Internal,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::{io, path::Path};
+
+    #[test]
+    fn a_caller_learns_nothing_of_the_machine() {
+        let path = || Path::new("/srv/secret/place").to_path_buf();
+        let message = || "/srv/secret/place: permission denied".to_owned();
+        let inside = [
+            StoreError::Directory { path: path(), message: message(), kind: io::ErrorKind::PermissionDenied }.into(),
+            StoreError::NewerSchema { path: path(), found: 9, supported: 1 }.into(),
+            StoreError::Foreign { path: path(), found: 9 }.into(),
+            StoreError::DiskFull { path: path() }.into(),
+            StoreError::Busy { path: path() }.into(),
+            StoreError::Database { path: path(), message: message() }.into(),
+            CallError::Internal(message()),
+        ];
+        for error in inside {
+            let status = Status::from(error);
+            assert!(!status.message().contains("secret") && status.message().contains(" incident "), "{status}");
+            let details = String::from_utf8_lossy(status.details()).into_owned();
+            assert!(!details.contains("secret"), "{details}");
+        }
     }
 }

@@ -75,6 +75,14 @@ pub enum StoreError {
         /// Bytes that it would hold.
         used: u64,
     },
+    /// A caller has recorded as much as it may, and this would be more.
+    #[error("expected at most {limit} recorded bytes of this caller, this would make {used}")]
+    AllowanceSpent {
+        /// Bytes that it may record.
+        limit: u64,
+        /// Bytes that it would have recorded.
+        used: u64,
+    },
     /// Another process held the database for longer than the busy timeout.
     #[error("{path} is locked by another process")]
     Busy {
@@ -110,7 +118,7 @@ impl StoreError {
             Some(ErrorCode::DiskFull) => Self::DiskFull { path },
             Some(ErrorCode::DatabaseBusy | ErrorCode::DatabaseLocked) => Self::Busy { path },
             Some(ErrorCode::DatabaseCorrupt | ErrorCode::NotADatabase) => {
-                Self::Corrupt { what: format!("database {}", path.display()), message: error.to_string() }
+                Self::Corrupt { what: "database".into(), message: error.to_string() }
             }
             _ => Self::Database { path, message: error.to_string() },
         }

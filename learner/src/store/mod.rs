@@ -8,6 +8,7 @@
 //! Deliberately absent: the wire (see `grpc`), and any change of what is stored; there is recording and
 //! deleting.
 
+mod allowance;
 mod backup;
 mod check;
 mod error;
@@ -24,6 +25,7 @@ mod writer;
 #[cfg(test)]
 mod tests;
 
+pub use allowance::Allowance;
 pub use backup::backup;
 pub use check::{Damage, Kind, Tally, Verification, verify};
 pub use error::StoreError;
@@ -112,6 +114,18 @@ impl Store {
 
     /// As [`Store::record`], but comes back as soon as the trajectories have their place in the order of recording.
     pub async fn queue_recordings(&self, recordings: Vec<Recording>) -> Result<Pending<u32>, StoreError> {
+        self.queue_recordings_of(None, recordings).await
+    }
+
+    /// As [`Store::queue_recordings`], at the expense of a caller.
+    ///
+    /// # Errors
+    /// As before; once written, [`StoreError::AllowanceSpent`] where the caller may not keep as much.
+    pub async fn queue_recordings_of(
+        &self,
+        allowance: Option<Allowance>,
+        recordings: Vec<Recording>,
+    ) -> Result<Pending<u32>, StoreError> {
         let bytes = recordings.iter().map(Recording::packed_bytes).sum::<usize>();
         let units = bytes.div_ceil(PENDING_UNIT).clamp(1, PENDING_BYTES / PENDING_UNIT);
         let pending = Arc::clone(&self.0.pending);
@@ -119,13 +133,17 @@ impl Store {
         let quota = self.0.options.max_bytes;
         let job = move |work: &mut writer::Work<'_>| {
             let _pending = pending;
-            let mut stored = 0;
+            let (mut stored, mut stored_bytes) = (0, 0);
             for (index, recording) in recordings.iter().enumerate() {
                 let new = trajectories::insert(work.connection, work.path, work.collections, recording, index)?;
                 stored += u32::from(new);
+                stored_bytes += if new { recording.packed_bytes() as u64 } else { 0 };
             }
             if stored > 0 {
                 check_quota(work, quota)?;
+                if let Some(allowance) = &allowance {
+                    allowance.charge(work.connection, work.path, stored_bytes)?;
+                }
             }
             Ok(stored)
         };
@@ -142,11 +160,27 @@ impl Store {
     /// # Errors
     /// [`StoreError::ModelExists`] where the rows are stored with another header, which is not to be replaced.
     pub async fn put_model(&self, model: Model, replace: bool) -> Result<Put, StoreError> {
+        self.put_model_of(None, model, replace).await
+    }
+
+    /// As [`Store::put_model`], at the expense of a caller.
+    ///
+    /// # Errors
+    /// As before, and [`StoreError::AllowanceSpent`] where the caller may not keep as much.
+    pub async fn put_model_of(
+        &self,
+        allowance: Option<Allowance>,
+        model: Model,
+        replace: bool,
+    ) -> Result<Put, StoreError> {
         let quota = self.0.options.max_bytes;
         let job = move |work: &mut writer::Work<'_>| {
             let put = models::insert(work.connection, work.path, &model, replace)?;
             if put != Put::Known {
                 check_quota(work, quota)?;
+                if let Some(allowance) = &allowance {
+                    allowance.charge(work.connection, work.path, model.packed_bytes())?;
+                }
             }
             Ok(put)
         };

@@ -52,6 +52,12 @@ pub struct ModelInfo {
 }
 
 impl Model {
+    /// Bytes of its rows.
+    pub fn packed_bytes(&self) -> u64 {
+        let Rows { row_lengths, next_states, probabilities, visit_counts } = &self.rows;
+        [row_lengths, next_states, probabilities, visit_counts].iter().map(|array| array.len() as u64).sum()
+    }
+
     /// Checks header and rows and names the model by its content.
     ///
     /// # Errors

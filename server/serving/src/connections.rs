@@ -1,4 +1,5 @@
-//! A bound on connections, which the transport has not: one above it is closed at once, so that its client learns of it.
+//! Connections, encrypted or not, and a bound on them, which the transport has not: one above it is closed at once, so that
+//! its client learns of it.
 
 use super::listen::{Accepted, Listener, Socket};
 use std::{
@@ -6,7 +7,7 @@ use std::{
     pin::Pin,
     sync::{
         Arc,
-        atomic::{AtomicUsize, Ordering},
+        atomic::{AtomicBool, AtomicUsize, Ordering},
     },
     task::{Context, Poll},
     time::Duration,
@@ -15,7 +16,7 @@ use tokio::{
     io::{AsyncRead, AsyncWrite, ReadBuf},
     sync::{OwnedSemaphorePermit, Semaphore},
 };
-use tonic::transport::server::Connected;
+use tokio_rustls::server::TlsStream;
 
 /// Pause after a connection that could not be taken: most often there are too many open files, and waiting helps.
 const PAUSE: Duration = Duration::from_millis(50);
@@ -76,40 +77,70 @@ impl Drop for Counted {
     }
 }
 
-/// A connection that counts until it is dropped.
+/// The bytes of a connection, encrypted or not.
 #[derive(Debug)]
-pub struct Connection {
-    /// Its bytes.
-    pub socket: Socket,
-    /// Its place among all that are admitted.
-    pub place: OwnedSemaphorePermit,
-    /// Its part of a worker's load.
-    pub load: Counted,
+enum Bytes {
+    Plain(Socket),
+    Tls(Box<TlsStream<Socket>>),
 }
 
-impl Connected for Connection {
-    type ConnectInfo = ();
+/// A connection that is ready for HTTP/2.
+#[derive(Debug)]
+pub struct Connection {
+    bytes: Bytes,
+    /// Told of the first byte that comes, and no more.
+    spoken: Option<Arc<AtomicBool>>,
+}
 
-    fn connect_info(&self) {}
+impl Connection {
+    /// A connection that is not encrypted. `spoken` becomes true with the first byte from the peer.
+    pub fn plain(socket: Socket, spoken: Arc<AtomicBool>) -> Self {
+        Self { bytes: Bytes::Plain(socket), spoken: Some(spoken) }
+    }
+
+    /// A connection whose handshake is done.
+    pub fn tls(stream: TlsStream<Socket>, spoken: Arc<AtomicBool>) -> Self {
+        Self { bytes: Bytes::Tls(Box::new(stream)), spoken: Some(spoken) }
+    }
 }
 
 impl AsyncRead for Connection {
     fn poll_read(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buf: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
-        Pin::new(&mut self.socket).poll_read(cx, buf)
+        let before = buf.filled().len();
+        let read = match &mut self.bytes {
+            Bytes::Plain(socket) => Pin::new(socket).poll_read(cx, buf),
+            Bytes::Tls(stream) => Pin::new(stream).poll_read(cx, buf),
+        };
+        if self.spoken.is_some()
+            && buf.filled().len() > before
+            && let Some(spoken) = self.spoken.take()
+        {
+            spoken.store(true, Ordering::Relaxed);
+        }
+        read
     }
 }
 
 impl AsyncWrite for Connection {
     fn poll_write(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buf: &[u8]) -> Poll<io::Result<usize>> {
-        Pin::new(&mut self.socket).poll_write(cx, buf)
+        match &mut self.bytes {
+            Bytes::Plain(socket) => Pin::new(socket).poll_write(cx, buf),
+            Bytes::Tls(stream) => Pin::new(stream).poll_write(cx, buf),
+        }
     }
 
     fn poll_flush(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
-        Pin::new(&mut self.socket).poll_flush(cx)
+        match &mut self.bytes {
+            Bytes::Plain(socket) => Pin::new(socket).poll_flush(cx),
+            Bytes::Tls(stream) => Pin::new(stream).poll_flush(cx),
+        }
     }
 
     fn poll_shutdown(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
-        Pin::new(&mut self.socket).poll_shutdown(cx)
+        match &mut self.bytes {
+            Bytes::Plain(socket) => Pin::new(socket).poll_shutdown(cx),
+            Bytes::Tls(stream) => Pin::new(stream).poll_shutdown(cx),
+        }
     }
 
     fn poll_write_vectored(
@@ -117,10 +148,16 @@ impl AsyncWrite for Connection {
         cx: &mut Context<'_>,
         bufs: &[io::IoSlice<'_>],
     ) -> Poll<io::Result<usize>> {
-        Pin::new(&mut self.socket).poll_write_vectored(cx, bufs)
+        match &mut self.bytes {
+            Bytes::Plain(socket) => Pin::new(socket).poll_write_vectored(cx, bufs),
+            Bytes::Tls(stream) => Pin::new(stream).poll_write_vectored(cx, bufs),
+        }
     }
 
     fn is_write_vectored(&self) -> bool {
-        self.socket.is_write_vectored()
+        match &self.bytes {
+            Bytes::Plain(socket) => socket.is_write_vectored(),
+            Bytes::Tls(stream) => stream.is_write_vectored(),
+        }
     }
 }

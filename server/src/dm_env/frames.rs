@@ -5,6 +5,7 @@ use super::process::process;
 use crate::grpc::host::Host;
 use bytes::{Buf as _, BufMut as _, Bytes};
 use futures_util::StreamExt as _;
+use mazeway_serving::Caller;
 use std::{
     convert::Infallible,
     pin::Pin,
@@ -71,7 +72,8 @@ impl StreamingService<Bytes> for Process {
     type Future = BoxFuture<Response<Self::ResponseStream>, Status>;
 
     fn call(&mut self, request: Request<Streaming<Bytes>>) -> Self::Future {
-        let answers = process(Arc::clone(&self.0), request.into_inner()).boxed();
+        let caller = Caller::of(&request);
+        let answers = process(Arc::clone(&self.0), caller, request.into_inner()).boxed();
         Box::pin(std::future::ready(Ok(Response::new(answers))))
     }
 }

@@ -14,7 +14,12 @@ use super::{
     world::World,
 };
 use crate::{
-    grpc::{CallError, aside::Aside, host::Host, interact::INLINE_ENVS},
+    grpc::{
+        CallError,
+        aside::Aside,
+        host::{Host, holder},
+        interact::INLINE_ENVS,
+    },
     sessions::{Guard, SessionError, SessionId},
     sim::options::shortened,
 };
@@ -23,6 +28,7 @@ use futures_util::{Stream, stream};
 use mazeway_proto::dm_env::{
     self as pb, environment_request::Payload as Request, environment_response::Payload as Response,
 };
+use mazeway_serving::Caller;
 use prost::Message as _;
 use std::{
     collections::BTreeMap,
@@ -38,8 +44,12 @@ use tokio_util::sync::WaitForCancellationFutureOwned;
 use tonic::{Status, Streaming};
 
 /// Answers the requests of `inbound`, in order.
-pub fn process(host: Arc<Host>, inbound: Streaming<Bytes>) -> impl Stream<Item = Result<Bytes, Status>> + Send {
-    let process = Process::new(host);
+pub fn process(
+    host: Arc<Host>,
+    caller: Caller,
+    inbound: Streaming<Bytes>,
+) -> impl Stream<Item = Result<Bytes, Status>> + Send {
+    let process = Process::new(host, caller);
     // After the end there is no state, and so nothing more to be asked.
     stream::unfold(Some((process, inbound)), async |state| {
         let (mut process, mut inbound) = state?;
@@ -61,6 +71,7 @@ pub fn process(host: Arc<Host>, inbound: Streaming<Bytes>) -> impl Stream<Item =
 /// One connection.
 pub struct Process {
     host: Arc<Host>,
+    caller: Caller,
     seat: Option<Seat>,
     /// Why there is no seat any more, where it was not left.
     lost: Option<SessionError>,
@@ -80,7 +91,7 @@ pub struct Process {
 
 impl Process {
     /// A connection that has joined no world.
-    pub fn new(host: Arc<Host>) -> Self {
+    pub fn new(host: Arc<Host>, caller: Caller) -> Self {
         let (interrupt_sender, interrupts) = mpsc::channel(1);
         Self {
             seat: None,
@@ -90,6 +101,7 @@ impl Process {
             idle: Box::pin(sleep_until((Instant::now() + host.config.default_lease).into())),
             shutdown: Box::pin(host.shutdown.clone().cancelled_owned()),
             host,
+            caller,
             interrupt_sender,
             interrupts,
             wished: Aside::new(),
@@ -231,9 +243,10 @@ impl Process {
     async fn create(&mut self, settings: BTreeMap<String, pb::Tensor>) -> Result<SessionId, WorldError> {
         let new = NewWorld::from_settings(Settings::new(settings))?;
         let (num_envs, lease, host) = (new.num_envs(), new.lease, Arc::clone(&self.host));
+        let holder = holder(&self.caller);
         let id = off_thread(move || {
             let make = new.plan(&host.registry, &host.config)?;
-            Ok(host.sessions.create(num_envs, lease, Instant::now(), make)?.0)
+            Ok(host.sessions.create(&holder, num_envs, lease, Instant::now(), make)?.0)
         });
         let id = id.await?;
         if lease.is_none() {
@@ -254,7 +267,7 @@ impl Process {
         let id = world_name(&request.world_name)?;
         let changes = Changes::from_settings(Settings::new(request.settings))?;
         let owner = Arc::new(self.interrupt_sender.clone());
-        let guard = self.host.sessions.take(id, Instant::now(), Some(owner))?;
+        let guard = self.host.sessions.take(id, self.caller.name(), Instant::now(), Some(owner))?;
         guard.set_waker(self.wished.waker().clone());
         let host = Arc::clone(&self.host);
         let seat = off_thread(move || Seat::take(guard, changes, &host)).await?;
@@ -276,7 +289,7 @@ impl Process {
 
     /// Takes a world for the while of a request.
     fn take_world(&self, id: SessionId) -> Result<Guard, WorldError> {
-        let mut guard = self.host.sessions.take(id, Instant::now(), None)?;
+        let mut guard = self.host.sessions.take(id, self.caller.name(), Instant::now(), None)?;
         World::of(&mut *guard).ok_or(SessionError::Unknown)?;
         Ok(guard)
     }
@@ -334,7 +347,7 @@ impl Drop for Process {
         self.seat = None;
         for id in self.made.drain(..) {
             // A world that somebody else is in stays, and its lease ends it after that.
-            if let Ok(guard) = self.host.sessions.take(id, Instant::now(), None) {
+            if let Ok(guard) = self.host.sessions.take(id, self.caller.name(), Instant::now(), None) {
                 guard.close();
             }
         }

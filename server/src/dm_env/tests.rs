@@ -21,7 +21,8 @@ use std::sync::Arc;
 use tokio_util::sync::CancellationToken;
 
 fn process() -> Process {
-    Process::new(Arc::new(Host::new(Config { max_total_envs: 64, ..Config::default() }, CancellationToken::new())))
+    let host = Host::new(Config { max_total_envs: 64, ..Config::default() }, CancellationToken::new());
+    Process::new(Arc::new(host), mazeway_serving::Caller::anybody())
 }
 
 fn runtime() -> tokio::runtime::Runtime {

@@ -7,10 +7,11 @@ use crate::{
     grpc::from_proto::{self, NewSession, RolloutLimits},
     registry::{Environment, Options, Registry},
     rollout::RolloutPlan,
-    sessions::{Guard, SessionId, Sessions},
+    sessions::{Guard, Holder, SessionId, Sessions},
     sim::TabularModel,
 };
 use mazeway_proto::env as pb;
+use mazeway_serving::Caller;
 use std::{
     sync::Arc,
     time::{Duration, Instant},
@@ -47,7 +48,11 @@ impl Host {
     }
 
     /// Creates a session, and says which it is and how long its lease.
-    pub fn create_session(self: &Arc<Self>, asked: &NewSession) -> Result<(Guard, Duration), CallError> {
+    pub fn create_session(
+        self: &Arc<Self>,
+        caller: &Caller,
+        asked: &NewSession,
+    ) -> Result<(Guard, Duration), CallError> {
         let environment = self.registry.configure(&asked.env_id, &asked.options)?;
         let spec = environment.spec();
         let options = BatchOptions {
@@ -62,10 +67,10 @@ impl Host {
             return Err(CallError::Limit { field: "num_envs", what, limit: limit as u64, asked: reply_bytes as u64 });
         }
         let now = Instant::now();
-        let (id, lease) =
-            self.sessions.create(asked.num_envs, asked.lease, now, || Arc::clone(&environment).batch(options))?;
+        let make = || Arc::clone(&environment).batch(options);
+        let (id, lease) = self.sessions.create(&holder(caller), asked.num_envs, asked.lease, now, make)?;
         tracing::debug!(session = ?id, env_id = spec.env_id, num_envs = asked.num_envs, ?lease, "session created");
-        Ok((self.sessions.take(id, now, None)?, lease))
+        Ok((self.sessions.take(id, caller.name(), now, None)?, lease))
     }
 
     /// Configures the environment of a roll-out and checks the plan.
@@ -83,9 +88,9 @@ impl Host {
         Ok((environment, plan))
     }
 
-    /// Takes a session for one call.
-    pub fn take(self: &Arc<Self>, id: SessionId) -> Result<Guard, CallError> {
-        Ok(self.sessions.take(id, Instant::now(), None)?)
+    /// Takes a session of the caller for one call.
+    pub fn take(self: &Arc<Self>, caller: &Caller, id: SessionId) -> Result<Guard, CallError> {
+        Ok(self.sessions.take(id, caller.name(), Instant::now(), None)?)
     }
 
     /// The tabular model of an environment, once there is a thread to compute it on.
@@ -109,6 +114,12 @@ impl Host {
             }
         }
     }
+}
+
+/// A caller as the holder of sessions.
+pub fn holder(caller: &Caller) -> Holder {
+    let quotas = caller.quotas();
+    Holder { name: caller.name().into(), max_sessions: quotas.max_sessions, max_envs: quotas.max_envs }
 }
 
 /// Runs work that takes a while off the async threads.

@@ -19,6 +19,7 @@ use crate::{
 use bytes::{Bytes, BytesMut};
 use http_body::Frame;
 use mazeway_proto::env::{self as pb, environment_service_server::EnvironmentServiceServer, interact_request::Request};
+use mazeway_serving::Caller;
 use std::{
     convert::Infallible,
     future::Future as _,
@@ -103,11 +104,12 @@ fn interact(host: &Arc<Host>, request: http::Request<Body>) -> http::Response<Bo
         response.headers_mut().insert("grpc-accept-encoding", http::HeaderValue::from_static("identity"));
         return response;
     }
+    let caller = Caller::of_http(&request);
     let settings = BufferSettings::new(REQUEST_BYTES, FRAME_BYTES);
     let decoder = ProstCodec::<pb::InteractResponse, pb::InteractRequest>::raw_decoder(settings);
     let limit = Some(host.config.max_message_bytes);
     let requests = Streaming::new_request(decoder, request.into_body(), None, limit);
-    let mut response = http::Response::new(Body::new(Interaction::new(Arc::clone(host), requests)));
+    let mut response = http::Response::new(Body::new(Interaction::new(Arc::clone(host), caller, requests)));
     response.headers_mut().insert(http::header::CONTENT_TYPE, GRPC_CONTENT_TYPE);
     response
 }
@@ -146,6 +148,7 @@ type Done = (Guard, BytesMut, Result<(), CallError>, Duration);
 /// A stream and, from its first message on, its session.
 struct Interaction {
     host: Arc<Host>,
+    caller: Caller,
     requests: Streaming<pb::InteractRequest>,
     /// Read, but to be answered after what is written has gone.
     waiting: Option<Request>,
@@ -222,13 +225,14 @@ impl http_body::Body for Interaction {
 }
 
 impl Interaction {
-    fn new(host: Arc<Host>, requests: Streaming<pb::InteractRequest>) -> Self {
+    fn new(host: Arc<Host>, caller: Caller, requests: Streaming<pb::InteractRequest>) -> Self {
         let (draw_sender, draw_jobs) = mpsc::channel(1);
         let (lease, last_used) = (host.config.default_lease, Instant::now());
         Self {
             idle: Box::pin(sleep_until((last_used + lease).into())),
             shutdown: Box::pin(host.shutdown.clone().cancelled_owned()),
             host,
+            caller,
             requests,
             waiting: None,
             held: None,
@@ -278,7 +282,7 @@ impl Interaction {
             }
             None => {
                 let (id, owner) = (from_proto::session_id(session_id)?, Arc::new(self.draw_sender.clone()));
-                let guard = self.host.sessions.take(id, Instant::now(), Some(owner))?;
+                let guard = self.host.sessions.take(id, self.caller.name(), Instant::now(), Some(owner))?;
                 self.lease = guard.lease();
                 self.idle.as_mut().reset((Instant::now() + self.lease).into());
                 guard.set_waker(self.aside.waker().clone());

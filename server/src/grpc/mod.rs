@@ -5,6 +5,7 @@ mod from_proto;
 pub(crate) mod host;
 pub(crate) mod interact;
 mod reply;
+mod rules;
 mod serve;
 mod service;
 mod status;

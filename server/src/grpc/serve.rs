@@ -1,13 +1,18 @@
 //! A server from a listener to its shutdown.
 
-use super::{host::Host, interact::Environments, service::EnvironmentGrpc, workers::Worker};
+use super::{host::Host, interact::Environments, rules::rule, service::EnvironmentGrpc, workers::Worker};
 use crate::{config::Config, dm_env};
 use futures_util::{StreamExt as _, stream::FuturesUnordered};
 use mazeway_proto::env::environment_service_server::EnvironmentServiceServer;
-use mazeway_serving::{Listener, connections::Gate};
-use std::{future::Future, io, sync::Arc, time::Duration};
+use mazeway_serving::{
+    DoorError, Listener,
+    connections::Gate,
+    door::Door,
+    transport::{Transport, Wire},
+};
+use std::{future::Future, io, sync::Arc};
 use tokio_util::sync::CancellationToken;
-use tonic::{service::Routes, transport::Server};
+use tonic::service::Routes;
 
 /// Bytes of a stream that may wait for their reader: some steps of the largest batch.
 const STREAM_WINDOW_BYTES: u32 = 1 << 20;
@@ -15,15 +20,13 @@ const STREAM_WINDOW_BYTES: u32 = 1 << 20;
 const CONNECTION_WINDOW_BYTES: u32 = 16 << 20;
 /// Largest frame taken in: a batch of actions comes in one.
 const FRAME_BYTES: u32 = 256 << 10;
-/// Time that a peer has to answer a ping.
-const PING_TIMEOUT: Duration = Duration::from_secs(10);
 
 /// Why a server could not go on.
 #[derive(Debug, thiserror::Error)]
 pub enum ServeError {
-    /// The transport failed.
-    #[error("the transport failed: {0}")]
-    Transport(#[from] tonic::transport::Error),
+    /// A certificate, a key or the file of tokens does not serve.
+    #[error(transparent)]
+    Door(#[from] DoorError),
     /// The descriptors of the protocol cannot be read.
     #[error("server reflection cannot read the descriptors: {0}")]
     Reflection(#[from] tonic_reflection::server::Error),
@@ -36,7 +39,7 @@ pub enum ServeError {
 /// [`Config::shutdown_grace`]. Interactive streams are told to go at once.
 ///
 /// # Errors
-/// The transport fails; there are no threads.
+/// The settings of the door cannot be followed; there are no threads.
 pub async fn serve(
     config: Config,
     listener: impl Into<Listener>,
@@ -54,16 +57,18 @@ pub async fn serve(
             .register_encoded_file_descriptor_set(mazeway_proto::DM_ENV_RPC_FILE_DESCRIPTOR_SET)
             .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
     };
-    let gate = Gate::new(listener.into(), config.max_connections);
-    let (server, threads, grace) = (transport(&config), config.threads(), config.shutdown_grace);
+    let gate = Gate::new(listener.into(), config.door.max_connections);
+    let door = Arc::new(Door::new(&config.door, rule)?);
+    let (wire, door_config) = (wire(&config), config.door.clone());
+    let (threads, grace) = (config.threads(), config.shutdown_grace);
     let host = Arc::new(Host::new(config, stopping.clone()));
     let routes = Routes::new(Environments::new(&host))
         .add_service(dm_env::EnvironmentServer(Arc::clone(&host)))
         .add_service(health_service)
         .add_service(reflection().build_v1()?)
-        .add_service(reflection().build_v1alpha()?)
-        .prepare();
-    let start = |_| Worker::start(server.clone(), routes.clone(), stopping.clone(), grace);
+        .add_service(reflection().build_v1alpha()?);
+    let transport = Transport::new(&door_config, wire, Arc::clone(&door), routes)?;
+    let start = |_| Worker::start(transport.clone(), stopping.clone(), grace);
     let mut workers = (0..threads).map(start).collect::<Result<Vec<_>, _>>()?;
     let reaper = tokio::spawn(host.reap_sessions());
     let hand_over = async {
@@ -76,6 +81,7 @@ pub async fn serve(
     };
     tokio::select! {
         () = hand_over => {}
+        () = door.guard() => {}
         () = shutdown => {}
     }
     health.set_not_serving::<EnvironmentServiceServer<EnvironmentGrpc>>().await;
@@ -93,13 +99,12 @@ pub async fn serve(
 }
 
 /// Settings of HTTP/2.
-fn transport(config: &Config) -> Server {
-    Server::builder()
-        .http2_keepalive_interval(Some(config.keepalive))
-        .http2_keepalive_timeout(Some(PING_TIMEOUT))
-        .initial_stream_window_size(STREAM_WINDOW_BYTES)
-        .initial_connection_window_size(CONNECTION_WINDOW_BYTES)
-        .max_frame_size(FRAME_BYTES)
-        .max_concurrent_streams(config.max_streams_per_connection)
-        .concurrency_limit_per_connection(config.max_streams_per_connection as usize)
+fn wire(config: &Config) -> Wire {
+    Wire {
+        keepalive: config.keepalive,
+        max_streams: config.max_streams_per_connection,
+        stream_window_bytes: STREAM_WINDOW_BYTES,
+        connection_window_bytes: CONNECTION_WINDOW_BYTES,
+        frame_bytes: FRAME_BYTES,
+    }
 }

@@ -14,6 +14,7 @@ use crate::{
 use bytes::Bytes;
 use futures_util::{Stream, StreamExt as _, stream};
 use mazeway_proto::env::{self as pb, environment_service_server::EnvironmentService};
+use mazeway_serving::Caller;
 use std::{pin::Pin, sync::Arc};
 use tokio::sync::{mpsc, oneshot};
 use tokio_stream::wrappers::ReceiverStream;
@@ -47,9 +48,10 @@ impl EnvironmentService for EnvironmentGrpc {
         &self,
         request: Request<pb::CreateSessionRequest>,
     ) -> Result<Response<pb::CreateSessionResponse>, Status> {
+        let caller = Caller::of(&request);
         let (asked, host) = (from_proto::create_session(request.into_inner())?, Arc::clone(&self.0));
         let session = blocking(move || {
-            let (guard, lease) = host.create_session(&asked)?;
+            let (guard, lease) = host.create_session(&caller, &asked)?;
             let lease = lease.try_into().map_err(|_| CallError::Internal("a lease beyond all bounds".into()))?;
             Ok(to_proto::session(guard.id().to_string(), lease, &*guard))
         });
@@ -57,8 +59,9 @@ impl EnvironmentService for EnvironmentGrpc {
     }
 
     async fn reset(&self, request: Request<pb::ResetRequest>) -> Result<Response<pb::ResetResponse>, Status> {
+        let caller = Caller::of(&request);
         let request = request.into_inner();
-        let guard = self.0.take(from_proto::session_id(&request.session_id)?)?;
+        let guard = self.0.take(&caller, from_proto::session_id(&request.session_id)?)?;
         let work = interact::run(guard, move |batch| {
             let (seeds, mask) = from_proto::reset(&request)?;
             Ok(to_proto::reset(batch.reset(seeds, mask)?))
@@ -67,8 +70,9 @@ impl EnvironmentService for EnvironmentGrpc {
     }
 
     async fn step(&self, request: Request<pb::StepRequest>) -> Result<Response<pb::StepResponse>, Status> {
+        let caller = Caller::of(&request);
         let request = request.into_inner();
-        let guard = self.0.take(from_proto::session_id(&request.session_id)?)?;
+        let guard = self.0.take(&caller, from_proto::session_id(&request.session_id)?)?;
         let work = interact::run(guard, move |batch| Ok(to_proto::step(batch.step(&request.actions)?)));
         Ok(Response::new(work.await?))
     }
@@ -107,29 +111,37 @@ impl EnvironmentService for EnvironmentGrpc {
     }
 
     async fn render(&self, request: Request<pb::RenderRequest>) -> Result<Response<pb::RenderResponse>, Status> {
+        let caller = Caller::of(&request);
         let request = request.into_inner();
         let (id, mode) = (from_proto::session_id(&request.session_id)?, from_proto::render_mode(request.mode)?);
-        let drawing = draw(&self.0, id, request.index as usize, mode).await?;
+        let drawing = draw(&self.0, &caller, id, request.index as usize, mode).await?;
         Ok(Response::new(finish(drawing, mode).await?))
     }
 
     async fn watch(&self, request: Request<pb::WatchRequest>) -> Result<Response<Self::WatchStream>, Status> {
-        Ok(Response::new(watch::watch(&self.0, request.get_ref())?.boxed()))
+        Ok(Response::new(watch::watch(&self.0, &Caller::of(&request), request.get_ref())?.boxed()))
     }
 
     async fn close_session(
         &self,
         request: Request<pb::CloseSessionRequest>,
     ) -> Result<Response<pb::CloseSessionResponse>, Status> {
-        self.0.take(from_proto::session_id(&request.into_inner().session_id)?)?.close();
+        let caller = Caller::of(&request);
+        self.0.take(&caller, from_proto::session_id(&request.into_inner().session_id)?)?.close();
         Ok(Response::new(pb::CloseSessionResponse {}))
     }
 }
 
 /// Draws an environment of a session that is free or owned by a stream.
-async fn draw(host: &Arc<Host>, id: SessionId, index: usize, mode: RenderMode) -> Result<String, CallError> {
+async fn draw(
+    host: &Arc<Host>,
+    caller: &Caller,
+    id: SessionId,
+    index: usize,
+    mode: RenderMode,
+) -> Result<String, CallError> {
     let busy = CallError::Session(SessionError::Busy);
-    match host.take(id) {
+    match host.take(caller, id) {
         Ok(guard) => Ok(interact::draw(&*guard, index, mode)?),
         Err(error) if error == busy => {
             let owner = host.sessions.owner(id).and_then(|owner| owner.downcast::<DrawSender>().ok());

@@ -148,8 +148,9 @@ pub fn with_details(code: Code, message: String, field: String, precondition: &s
             details.add_quota_failure_violation(field, message.as_str());
         }
         Code::Internal => {
-            tracing::error!(%message, "a call failed through no fault of its caller");
-            return Status::new(code, message);
+            let incident = mazeway_serving::incident();
+            tracing::error!(%message, incident, "a call failed through no fault of its caller");
+            return Status::new(code, format!("internal error; the server's log has more under incident {incident}"));
         }
         Code::Unavailable => return Status::new(code, message),
         _ => {
@@ -157,4 +158,17 @@ pub fn with_details(code: Code, message: String, field: String, precondition: &s
         }
     }
     Status::with_error_details(code, message, details)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_caller_learns_nothing_of_the_machine() {
+        let status = Status::from(CallError::Internal("task 7 panicked at /srv/secret/place".into()));
+        assert_eq!(status.code(), Code::Internal);
+        assert!(!status.message().contains("secret") && status.message().contains(" incident "), "{status}");
+        assert!(status.details().is_empty());
+    }
 }

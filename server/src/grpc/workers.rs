@@ -6,17 +6,13 @@
 
 use super::serve::ServeError;
 use mazeway_serving::{
-    connections::{Connection, Counted, Load},
+    connections::{Counted, Load},
     listen::Accepted,
+    transport::Transport,
 };
 use std::{io, thread, time::Duration};
-use tokio::{
-    sync::{OwnedSemaphorePermit, mpsc, oneshot},
-    time::timeout,
-};
-use tokio_stream::{StreamExt as _, wrappers::UnboundedReceiverStream};
-use tokio_util::sync::CancellationToken;
-use tonic::{service::Routes, transport::Server};
+use tokio::sync::{OwnedSemaphorePermit, mpsc, oneshot};
+use tokio_util::{sync::CancellationToken, task::TaskTracker};
 
 /// A connection on its way to its worker: there are never more than connections are admitted.
 type Arrival = (Accepted, OwnedSemaphorePermit, Counted);
@@ -25,26 +21,21 @@ type Arrival = (Accepted, OwnedSemaphorePermit, Counted);
 pub struct Worker {
     arrivals: mpsc::UnboundedSender<Arrival>,
     load: Load,
-    ended: oneshot::Receiver<Result<(), ServeError>>,
+    ended: oneshot::Receiver<()>,
 }
 
 impl Worker {
     /// Starts a thread that serves what it is given until `stopping`, and then for `grace` what is under way.
-    pub fn start(
-        server: Server,
-        routes: Routes,
-        stopping: CancellationToken,
-        grace: Duration,
-    ) -> Result<Self, ServeError> {
+    pub fn start(transport: Transport, stopping: CancellationToken, grace: Duration) -> Result<Self, ServeError> {
         let (arrivals, arriving) = mpsc::unbounded_channel();
         let (end, ended) = oneshot::channel();
         let runtime =
             tokio::runtime::Builder::new_current_thread().enable_all().build().map_err(ServeError::Threads)?;
         let work = move || {
-            let outcome = runtime.block_on(serve(server, routes, arriving, stopping, grace));
+            runtime.block_on(serve(transport, arriving, stopping, grace));
             // What still runs on threads for blocking work ends by itself: nobody waits for its outcome.
             runtime.shutdown_background();
-            let _ = end.send(outcome);
+            let _ = end.send(());
         };
         thread::Builder::new().name("mazeway-worker".into()).spawn(work).map_err(ServeError::Threads)?;
         Ok(Self { arrivals, load: Load::default(), ended })
@@ -63,26 +54,27 @@ impl Worker {
 
     /// Waits for its end.
     pub async fn ended(&mut self) -> Result<(), ServeError> {
-        (&mut self.ended).await.unwrap_or_else(|_| Err(ServeError::Threads(io::Error::other("a worker panicked"))))
+        (&mut self.ended).await.map_err(|_| ServeError::Threads(io::Error::other("a worker panicked")))
     }
 }
 
 async fn serve(
-    mut server: Server,
-    routes: Routes,
-    arriving: mpsc::UnboundedReceiver<Arrival>,
+    transport: Transport,
+    mut arriving: mpsc::UnboundedReceiver<Arrival>,
     stopping: CancellationToken,
     grace: Duration,
-) -> Result<(), ServeError> {
-    let incoming = UnboundedReceiverStream::new(arriving).map(|(connection, place, load)| {
-        Ok::<_, io::Error>(Connection { socket: connection.into_socket()?, place, load })
-    });
-    let stop = stopping.clone().cancelled_owned();
-    let serving = server.add_routes(routes).serve_with_incoming_shutdown(incoming, stop);
-    tokio::pin!(serving);
-    tokio::select! {
-        outcome = &mut serving => Ok(outcome?),
-        // Calls that need longer are cut off.
-        () = stopping.cancelled() => Ok(timeout(grace, serving).await.unwrap_or(Ok(()))?),
+) {
+    let connections = TaskTracker::new();
+    loop {
+        let arrived = tokio::select! {
+            biased;
+            () = stopping.cancelled() => break,
+            arrived = arriving.recv() => arrived,
+        };
+        let Some((accepted, place, load)) = arrived else { break };
+        let (transport, stopping) = (transport.clone(), stopping.clone());
+        connections.spawn(async move { transport.serve(accepted, (place, load), &stopping, grace).await });
     }
+    connections.close();
+    connections.wait().await;
 }

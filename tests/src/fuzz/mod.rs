@@ -5,6 +5,7 @@
 //! is caught with its input, memory is metered by the caller, a hang is an execution that takes longer than [`SLOW`].
 
 pub mod mutate;
+pub mod requests;
 pub mod targets;
 
 use mutate::{Mutator, below};

@@ -1,13 +1,21 @@
-//! What reads bytes from outside in the learner, each as a function from bytes to an answer.
+//! What reads bytes from outside, each as a function from bytes to an answer.
 //!
 //! A reader checks what comes out as well: it has the shape that its type promises.
 
+use super::requests;
 use crate::learner::trajectory;
+use clap::CommandFactory as _;
 use mazeway_learner::{
     files::{Collector, Demonstration, Names, ParquetExport, ReadOptions, Step, read, read_model},
     store::{self, Arrays, Collection, Filter, Model, Recording, Rows, Store},
 };
 use mazeway_proto::{env::ModelHeader, learner as pb};
+use mazeway_server::config::Cli;
+use mazeway_serving::{
+    grant::{Quotas, Scope},
+    settings,
+    tokens::{self, Tokens},
+};
 use prost::Message as _;
 use std::{
     cell::RefCell,
@@ -93,8 +101,30 @@ const WIRE: &[&[u8]] =
 const DATABASE: &[&[u8]] =
     &[b"SQLite format 3\0", b"\x0d", b"\x0a", b"\x05", b"\x02", b"\x00\x00\x00\x00", b"\x10\x00", b"CREATE TABLE"];
 
+const TOML: &[&[u8]] = &[
+    b"[[token]]\n",
+    b"name = ",
+    b"sha256 = ",
+    b"scopes = [",
+    b"\"act\"",
+    b"expires = 2027-01-01T00:00:00Z\n",
+    b"max-sessions = ",
+    b"max_sessions = ",
+    b"insecure = true\n",
+    b"-1",
+    b"1e999",
+    b"99999999999999999999",
+    b"\"",
+    b"'''",
+    b"\n",
+    b"{",
+    b"}",
+    b"\xff",
+    b"\\u0000",
+];
+
 /// All of them.
-pub const TARGETS: [Target; 9] = [
+pub const TARGETS: [Target; 13] = [
     Target {
         name: "demonstrations-csv",
         read: |bytes| demonstrations("x.csv", bytes),
@@ -139,12 +169,28 @@ pub const TARGETS: [Target; 9] = [
     },
     Target { name: "packed-arrays", read: packed_arrays, seeds: trajectories, words: WIRE, max_bytes: 2000 },
     Target { name: "model-message", read: model_message, seeds: model_messages, words: WIRE, max_bytes: 2000 },
+    Target {
+        name: "environment-requests",
+        read: requests::environment,
+        seeds: requests::environment_seeds,
+        words: WIRE,
+        max_bytes: 2000,
+    },
+    Target {
+        name: "learner-requests",
+        read: requests::learner,
+        seeds: requests::learner_seeds,
+        words: WIRE,
+        max_bytes: 2000,
+    },
+    Target { name: "settings-file", read: settings_file, seeds: settings_files, words: TOML, max_bytes: 2000 },
+    Target { name: "tokens-file", read: tokens_file, seeds: tokens_files, words: TOML, max_bytes: 2000 },
     Target { name: "store-file", read: store_file, seeds: store_files, words: DATABASE, max_bytes: 80_000 },
 ];
 
 /// The target of a name.
 pub fn find(name: &str) -> Option<&'static Target> {
-    static ALL: [Target; 9] = TARGETS;
+    static ALL: [Target; 13] = TARGETS;
     ALL.iter().find(|target| target.name == name)
 }
 
@@ -227,6 +273,32 @@ fn model(name: &str, bytes: &[u8]) -> Result<String, String> {
     })?;
     let model = model.into_model("Fuzz".into()).map_err(|error| error.message)?;
     Ok(format!("{} states", model.n_states))
+}
+
+fn settings_files() -> Vec<Vec<u8>> {
+    let text =
+        "max-sessions = 10\nlisten = \"127.0.0.1:0\"\nkeepalive-secs = 2.5\nopen_reflection = true\ntokens = \"t\"\n";
+    vec![text.into()]
+}
+
+fn settings_file(bytes: &[u8]) -> Result<String, String> {
+    let text = std::str::from_utf8(bytes).map_err(|error| error.to_string())?;
+    let values =
+        settings::values(text, &Cli::command()).inspect_err(|error| assert!(!error.contains('\n'), "{error}"))?;
+    Ok(format!("{} settings", values.len()))
+}
+
+fn tokens_files() -> Vec<Vec<u8>> {
+    let quotas = Quotas { max_sessions: Some(3), ..Quotas::default() };
+    let entry = |name: &str| tokens::mint(name, &Scope::ALL, &quotas, None).expect("a token").entry;
+    vec![entry("alice").into(), format!("{}expires = 2027-01-01T00:00:00Z\n\n{}", entry("alice"), entry("bob")).into()]
+}
+
+fn tokens_file(bytes: &[u8]) -> Result<String, String> {
+    let text = std::str::from_utf8(bytes).map_err(|error| error.to_string())?;
+    let tokens = Tokens::parse(text).inspect_err(|error| assert!(!error.contains('\n'), "{error}"))?;
+    assert!(tokens.find(b"mzw_").is_none());
+    Ok(format!("{} tokens", tokens.len()))
 }
 
 fn trajectories() -> Vec<Vec<u8>> {

@@ -17,6 +17,7 @@ use super::{
 use futures_util::{Stream, stream};
 use gallery::{Frame, Place, Shown, Subject};
 use mazeway_proto::env as pb;
+use mazeway_serving::Caller;
 use painter::Style;
 use std::{
     sync::Arc,
@@ -33,6 +34,7 @@ const MIN_FPS: f32 = 0.01;
 /// Lets a viewer in.
 pub fn watch(
     host: &Arc<Host>,
+    caller: &Caller,
     request: &pb::WatchRequest,
 ) -> Result<impl Stream<Item = Result<pb::WatchResponse, Status>> + Send + use<>, CallError> {
     let session = from_proto::session_id(&request.session_id)?;
@@ -45,7 +47,9 @@ pub fn watch(
         (width, _) => width,
     };
     let asked = request.max_fps;
-    let fps = if asked == 0.0 { host.sessions.render_fps(session, Instant::now())? as f32 } else { asked };
+    // Also whether it may look at all: viewers of one session share what they see.
+    let own = host.sessions.render_fps(session, caller.name(), Instant::now())? as f32;
+    let fps = if asked == 0.0 { own } else { asked };
     if !(MIN_FPS..=f32::MAX).contains(&fps) {
         let message =
             format!("expected at least {MIN_FPS} pictures a second, or 0 for the environment's own, got {asked}");
@@ -53,7 +57,6 @@ pub fn watch(
     }
     let pause = Duration::from_secs_f32(1.0 / fps.min(MAX_FPS));
     let subject = Subject { session, index: request.index as usize, style: Style { mode, max_width } };
-    // Where there is no such session, its first look says so.
     let place = Gallery::enter(host, subject, pause)?;
     let viewer = Viewer { place, pause, due: Instant::now(), seen: None };
     Ok(stream::unfold(Some(viewer), async |viewer| {

@@ -1,0 +1,321 @@
+//! The door: who calls is found out once a call, what the call needs is looked up, and its deadline is kept.
+//!
+//! Invariants: no part of a service sees a request before its caller is known and may make it; the secret goes no further
+//! than this; an answer that a deadline cuts off gives back what it holds before the caller hears of it.
+
+use crate::{
+    caller::Caller,
+    config::{DoorConfig, DoorError},
+    keyring::Keyring,
+    rules::{Need, Rule, Rules, common},
+    watch::{Call, Visit, Watch},
+};
+use bytes::Bytes;
+use http::{HeaderMap, Request, Response, header::AUTHORIZATION};
+use http_body::{Body as _, Frame, SizeHint};
+use hyper::body::Incoming;
+use std::{
+    convert::Infallible,
+    pin::Pin,
+    sync::Arc,
+    task::{Context, Poll},
+    time::{Duration, SystemTime},
+};
+use tokio::time::{Instant, Sleep, sleep_until, timeout_at};
+use tonic::{Status, body::Body, service::Routes};
+use tower::ServiceExt as _;
+
+/// Bytes of an answer that the transport is given at a time: it counts a stream that it was given everything of as done.
+const SLICE_BYTES: usize = 64 << 10;
+/// Longest deadline that `grpc-timeout` can ask for and a timer can count: far beyond any call.
+const FAR: Duration = Duration::from_hours(24 * 365);
+
+/// Lets callers in.
+#[derive(Debug)]
+pub struct Door {
+    keyring: Option<Keyring>,
+    /// Whether callers are known by their certificates where there are no tokens.
+    mutual: bool,
+    rules: Rules,
+    open_reflection: bool,
+    call_deadline: Duration,
+    max_call_deadline: Duration,
+    /// Who and what is inside.
+    pub watch: Arc<Watch>,
+}
+
+impl Door {
+    /// A door by its settings, for a service with these rules.
+    ///
+    /// # Errors
+    /// The file of tokens does not serve.
+    pub fn new(config: &DoorConfig, rules: Rules) -> Result<Self, DoorError> {
+        Ok(Self {
+            keyring: config.keyring()?,
+            mutual: config.tls_client_ca.is_some(),
+            rules,
+            open_reflection: config.open_reflection,
+            call_deadline: config.call_deadline,
+            max_call_deadline: config.max_call_deadline,
+            watch: Watch::new(config),
+        })
+    }
+
+    /// Looks after what is inside, and at the file of tokens, for as long as it is polled.
+    pub async fn guard(&self) {
+        loop {
+            tokio::time::sleep(self.watch.pause()).await;
+            if let Some(keyring) = &self.keyring {
+                keyring.refresh();
+            }
+            self.watch.look();
+        }
+    }
+
+    /// Who calls.
+    fn caller(&self, headers: &HeaderMap, visit: &Visit) -> Result<Caller, Status> {
+        let Some(keyring) = &self.keyring else {
+            return match visit.certified() {
+                Some(caller) => Ok(caller.clone()),
+                // The handshake would not have come to its end.
+                None if self.mutual => Err(Status::unauthenticated("expected a client certificate, got none")),
+                None => Ok(Caller::anybody()),
+            };
+        };
+        let mut shown = headers.get_all(AUTHORIZATION).iter();
+        let (Some(shown), None) = (shown.next(), shown.next()) else {
+            return Err(Status::unauthenticated("expected metadata 'authorization: Bearer TOKEN', once"));
+        };
+        let shown = shown.as_bytes();
+        let secret = match shown.split_first_chunk::<7>() {
+            Some((scheme, secret)) if scheme.eq_ignore_ascii_case(b"bearer ") => secret,
+            _ => return Err(Status::unauthenticated("expected metadata 'authorization: Bearer TOKEN'")),
+        };
+        // An expired token is as unknown as any other: who does not hold it learns nothing.
+        let grant = keyring.find(secret).filter(|grant| grant.holds(SystemTime::now()));
+        grant.map(Caller::from).ok_or_else(|| Status::unauthenticated("the token is unknown, revoked or expired"))
+    }
+
+    fn admit(&self, rule: Rule, path: &str, headers: &HeaderMap, visit: &Visit) -> Result<Caller, Status> {
+        if rule.need == Need::Nothing {
+            return Ok(Caller::anybody());
+        }
+        let caller = self.caller(headers, visit)?;
+        match rule.need {
+            Need::Scope(scopes) if !scopes.iter().any(|scope| caller.may(*scope)) => {
+                let names: Vec<_> = scopes.iter().map(|scope| scope.name()).collect();
+                let (name, method) = (caller.name(), path.rsplit('/').next().unwrap_or_default());
+                let method: String = method.chars().take(64).collect();
+                let message = format!("{method} needs the scope {}, which token {name:?} has not", names.join(" or "));
+                Err(Status::permission_denied(message))
+            }
+            _ => Ok(caller),
+        }
+    }
+
+    fn rule(&self, path: &str) -> Rule {
+        common(path, self.open_reflection).unwrap_or_else(|| (self.rules)(path))
+    }
+}
+
+/// Passes the calls of one connection on to a service.
+#[derive(Debug, Clone)]
+pub struct Entrance {
+    door: Arc<Door>,
+    visit: Arc<Visit>,
+    routes: Routes,
+}
+
+impl Entrance {
+    /// For the calls of `visit`.
+    pub fn new(door: Arc<Door>, visit: Arc<Visit>, routes: Routes) -> Self {
+        Self { door, visit, routes }
+    }
+
+    fn enter(&self, request: &mut Request<Incoming>) -> Result<(Caller, Option<Instant>, bool), Status> {
+        if self.visit.holds_too_much() {
+            return Err(Status::resource_exhausted(
+                "expected the answers of this connection to be read before further calls",
+            ));
+        }
+        let rule = self.door.rule(request.uri().path());
+        let caller = self.door.admit(rule, request.uri().path(), request.headers(), &self.visit)?;
+        request.headers_mut().remove(AUTHORIZATION);
+        let asked = asked_time(request.headers())?;
+        let allowed = match (rule.streams, asked) {
+            (true, asked) => asked,
+            (false, None) => Some(self.door.call_deadline.min(self.door.max_call_deadline)),
+            (false, Some(asked)) => Some(asked.min(self.door.max_call_deadline)),
+        };
+        Ok((caller, allowed.map(|allowed| Instant::now() + allowed.min(FAR)), rule.streams))
+    }
+}
+
+impl hyper::service::Service<Request<Incoming>> for Entrance {
+    type Response = Response<Answer>;
+    type Error = Infallible;
+    type Future = Pin<Box<dyn Future<Output = Result<Response<Answer>, Infallible>> + Send>>;
+
+    fn call(&self, mut request: Request<Incoming>) -> Self::Future {
+        let entered = self.enter(&mut request);
+        let caller = entered.as_ref().map_or_else(|_| Caller::anybody(), |(caller, ..)| caller.clone());
+        let call = self.visit.call(caller);
+        let (caller, deadline, streams) = match entered {
+            Ok(entered) => entered,
+            Err(status) => {
+                let response = status.into_http::<Body>().map(|body| Answer::new(body, call, None));
+                return Box::pin(std::future::ready(Ok(response)));
+            }
+        };
+        request.extensions_mut().insert(caller);
+        let answering = self.routes.clone().oneshot(request.map(Body::new));
+        Box::pin(async move {
+            let response = match deadline {
+                None => answering.await?,
+                Some(deadline) => match timeout_at(deadline, answering).await {
+                    Ok(response) => response?,
+                    Err(_) => too_late().into_http(),
+                },
+            };
+            Ok(response.map(|body| Answer::new(body, call, deadline.filter(|_| streams))))
+        })
+    }
+}
+
+fn too_late() -> Status {
+    Status::deadline_exceeded("the deadline of the call has passed")
+}
+
+/// The time that a caller gives a call. gRPC: at most eight digits and a unit.
+fn asked_time(headers: &HeaderMap) -> Result<Option<Duration>, Status> {
+    let Some(value) = headers.get("grpc-timeout") else { return Ok(None) };
+    let read = || {
+        let (unit, digits) = value.as_bytes().split_last()?;
+        if !(1..=8).contains(&digits.len()) || !digits.iter().all(u8::is_ascii_digit) {
+            return None;
+        }
+        let number = std::str::from_utf8(digits).ok()?.parse::<u64>().ok()?;
+        Some(match unit {
+            b'H' => Duration::from_secs(number * 3600),
+            b'M' => Duration::from_secs(number * 60),
+            b'S' => Duration::from_secs(number),
+            b'm' => Duration::from_millis(number),
+            b'u' => Duration::from_micros(number),
+            b'n' => Duration::from_nanos(number),
+            _ => return None,
+        })
+    };
+    read()
+        .map(Some)
+        .ok_or_else(|| Status::invalid_argument("grpc-timeout: expected 1 to 8 digits and one of H M S m u n"))
+}
+
+/// An answer on its way, watched over.
+#[derive(Debug)]
+pub struct Answer {
+    body: Body,
+    /// What is still to be given of a large frame.
+    rest: Bytes,
+    call: Arc<Call>,
+    deadline: Option<Pin<Box<Sleep>>>,
+}
+
+impl Answer {
+    fn new(body: Body, call: Arc<Call>, deadline: Option<Instant>) -> Self {
+        if body.is_end_stream() {
+            call.completes();
+        }
+        Self { body, rest: Bytes::new(), call, deadline: deadline.map(|deadline| Box::pin(sleep_until(deadline))) }
+    }
+}
+
+impl http_body::Body for Answer {
+    type Data = Bytes;
+    type Error = Status;
+
+    fn poll_frame(self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
+        let this = self.get_mut();
+        if let Some(deadline) = &mut this.deadline
+            && deadline.as_mut().poll(cx).is_ready()
+        {
+            this.body = Body::empty();
+            this.forget();
+            this.deadline = None;
+            this.call.completes();
+            let mut trailers = HeaderMap::with_capacity(2);
+            return Poll::Ready(Some(too_late().add_header(&mut trailers).map(|()| Frame::trailers(trailers))));
+        }
+        if !this.rest.is_empty() {
+            let rest = std::mem::take(&mut this.rest);
+            return Poll::Ready(Some(Ok(this.slice(rest))));
+        }
+        let polled = Pin::new(&mut this.body).poll_frame(cx);
+        match polled {
+            Poll::Pending => this.call.waits(),
+            Poll::Ready(Some(Ok(frame))) if frame.is_data() => {
+                this.call.took();
+                return Poll::Ready(Some(match frame.into_data() {
+                    Ok(bytes) if bytes.len() > SLICE_BYTES => {
+                        this.call.visit().holds(bytes.len());
+                        Ok(this.slice(bytes))
+                    }
+                    Ok(bytes) => Ok(Frame::data(bytes)),
+                    Err(frame) => Ok(frame),
+                }));
+            }
+            Poll::Ready(_) => this.call.completes(),
+        }
+        polled
+    }
+
+    fn is_end_stream(&self) -> bool {
+        self.rest.is_empty() && self.body.is_end_stream()
+    }
+
+    fn size_hint(&self) -> SizeHint {
+        // Of the body alone: without the rest it would be wrong.
+        if self.rest.is_empty() { self.body.size_hint() } else { SizeHint::default() }
+    }
+}
+
+impl Answer {
+    /// The beginning of what is left, which the connection holds until then.
+    fn slice(&mut self, mut bytes: Bytes) -> Frame<Bytes> {
+        self.call.took();
+        let slice = bytes.split_to(bytes.len().min(SLICE_BYTES));
+        self.call.visit().gives(slice.len());
+        self.rest = bytes;
+        Frame::data(slice)
+    }
+
+    /// Forgets what is left.
+    fn forget(&mut self) {
+        self.call.visit().gives(std::mem::take(&mut self.rest).len());
+    }
+}
+
+impl Drop for Answer {
+    fn drop(&mut self) {
+        self.forget();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn times_are_read_as_grpc_writes_them() {
+        let read = |text: &str| {
+            let mut headers = HeaderMap::new();
+            headers.insert("grpc-timeout", text.parse().expect("a value"));
+            asked_time(&headers)
+        };
+        assert_eq!(read("2H").expect("reads"), Some(Duration::from_hours(2)));
+        assert_eq!(read("99999999n").expect("reads"), Some(Duration::from_nanos(99_999_999)));
+        assert_eq!(asked_time(&HeaderMap::new()).expect("none"), None);
+        for wrong in ["", "S", "5", "-1S", "1.5S", "999999999S", "5s"] {
+            assert!(read(wrong).is_err(), "{wrong}");
+        }
+    }
+}

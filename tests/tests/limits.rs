@@ -1,0 +1,163 @@
+//! What a peer may take of the transport, and for how long: deadlines, idle and silent connections, readers that do not
+//! read, calls given up without end, metadata beyond all bounds. Each limit is tried against a real server, beside a
+//! neighbour that it must not touch.
+
+use mazeway_client::{Code, channel, packed::pack};
+use mazeway_proto::env::{
+    self as pb, environment_service_client::EnvironmentServiceClient, rollout_request::Controller,
+};
+use mazeway_server::Config;
+use mazeway_serving::DoorConfig;
+use mazeway_tests::{EnvServer, config};
+use std::time::Duration;
+use tokio::{
+    io::{AsyncReadExt as _, AsyncWriteExt as _},
+    net::TcpStream,
+    time::{Instant, sleep, timeout},
+};
+use tonic::{Request, Response, transport::Channel};
+
+type Service = EnvironmentServiceClient<Channel>;
+
+fn server(door: DoorConfig) -> EnvServer {
+    EnvServer::with(Config { door, ..config() })
+}
+
+async fn service(server: &EnvServer) -> Service {
+    EnvironmentServiceClient::new(channel(&server.address()).await.expect("a channel"))
+}
+
+async fn lists(service: &mut Service) -> bool {
+    service.list_environments(pb::ListEnvironmentsRequest {}).await.is_ok()
+}
+
+#[tokio::test]
+async fn a_call_that_asks_for_no_deadline_has_one() {
+    let server = server(DoorConfig { call_deadline: Duration::from_millis(1), ..DoorConfig::default() });
+    let mut service = service(&server).await;
+    let large = pb::CreateSessionRequest { env_id: "Highway-v0".into(), num_envs: 16_384, ..Default::default() };
+    let status = service.create_session(large).await.expect_err("it takes longer");
+    assert_eq!(status.code(), Code::DeadlineExceeded, "{status}");
+    // A stream has the deadline that it asks for, and none otherwise.
+    let begun = Instant::now();
+    let mut request = Request::new(tokio_stream::pending());
+    request.metadata_mut().insert("grpc-timeout", "300m".parse().expect("a value"));
+    let mut asked = service.interact(request).await.expect("a stream").into_inner();
+    let mut unasked = service.interact(tokio_stream::pending()).await.expect("a stream").into_inner();
+    let status = asked.message().await.expect_err("it ends");
+    assert_eq!(status.code(), Code::DeadlineExceeded, "{status}");
+    assert!(begun.elapsed() >= Duration::from_millis(290), "{:?}", begun.elapsed());
+    timeout(Duration::from_millis(200), unasked.message()).await.expect_err("it goes on");
+    let mut wrong = Request::new(pb::ListEnvironmentsRequest {});
+    wrong.metadata_mut().insert("grpc-timeout", "soon".parse().expect("a value"));
+    let status = service.list_environments(wrong).await.expect_err("no time");
+    assert!(status.code() == Code::InvalidArgument && status.message().starts_with("grpc-timeout: "), "{status}");
+}
+
+/// Waits for the end of a connection, and says how long that took.
+async fn ends(mut connection: TcpStream) -> Duration {
+    let begun = Instant::now();
+    let mut bytes = [0; 1024];
+    let end = async { while matches!(connection.read(&mut bytes).await, Ok(1..)) {} };
+    timeout(Duration::from_secs(20), end).await.expect("an end");
+    begun.elapsed()
+}
+
+#[tokio::test]
+async fn silent_and_idle_connections_are_closed_and_used_ones_stay() {
+    let door = DoorConfig {
+        handshake_timeout: Duration::from_millis(300),
+        idle_timeout: Duration::from_millis(900),
+        ..DoorConfig::default()
+    };
+    let server = server(door);
+    let mut service = service(&server).await;
+    let mut stream = service.interact(tokio_stream::pending()).await.expect("a stream").into_inner();
+    let silent = TcpStream::connect(server.socket()).await.expect("connects");
+    let mut idle = TcpStream::connect(server.socket()).await.expect("connects");
+    idle.write_all(b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n\0\0\0\x04\0\0\0\0\0").await.expect("greets");
+    let (silent, idle) = tokio::join!(ends(silent), ends(idle));
+    assert!(silent >= Duration::from_millis(250) && idle >= Duration::from_millis(800), "{silent:?}, {idle:?}");
+    // Half a greeting is no better than none.
+    let mut half = TcpStream::connect(server.socket()).await.expect("connects");
+    half.write_all(b"PRI * HTT").await.expect("greets");
+    ends(half).await;
+    timeout(Duration::from_millis(100), stream.message()).await.expect_err("it goes on");
+}
+
+#[tokio::test]
+async fn a_stream_that_nobody_reads_ends_and_its_neighbour_goes_on() {
+    let server = server(DoorConfig { stall_timeout: Duration::from_millis(500), ..DoorConfig::default() });
+    let mut service = service(&server).await;
+    let request = pb::RolloutRequest {
+        env_id: "Maze-v0".into(),
+        controller: Some(Controller::Driver("random".into())),
+        episodes: 1_000_000,
+        steps: 100,
+        ..Default::default()
+    };
+    let mut unread = service.rollout(request).await.expect("a stream").into_inner();
+    let session = pb::CreateSessionRequest { env_id: "Maze-v0".into(), ..Default::default() };
+    let session_id = service.create_session(session).await.expect("a session").into_inner().session_id;
+    let reset = pb::ResetRequest { session_id: session_id.clone(), seed: Some(1), ..Default::default() };
+    service.reset(reset).await.expect("resets");
+    let begun = Instant::now();
+    while begun.elapsed() < Duration::from_secs(3) {
+        let step = pb::StepRequest { session_id: session_id.clone(), actions: pack([0_i32]) };
+        service.step(step).await.expect("steps on the same connection");
+        sleep(Duration::from_millis(20)).await;
+    }
+    // What had come is there; then it ends, long before the roll-out would.
+    let rest = async {
+        loop {
+            match unread.message().await {
+                Ok(Some(_)) => {}
+                end => return end,
+            }
+        }
+    };
+    timeout(Duration::from_secs(10), rest).await.expect("an end").expect_err("it is cut off");
+}
+
+#[tokio::test]
+async fn calls_given_up_without_end_close_their_connection() {
+    let server = server(DoorConfig { max_resets_per_second: 50, ..DoorConfig::default() });
+    let (mut hostile, mut neighbour) = (service(&server).await, service(&server).await);
+    let open = async |service: &mut Service| service.interact(tokio_stream::pending()).await.map(Response::into_inner);
+    let mut of_hostile = open(&mut hostile).await.expect("a stream");
+    let mut of_neighbour = open(&mut neighbour).await.expect("a stream");
+    // As many as a client may need.
+    for _ in 0..30 {
+        drop(open(&mut neighbour).await.expect("a stream"));
+    }
+    let ended = async {
+        loop {
+            // Its channel connects anew by itself: that it was closed is seen by the stream that it had.
+            drop(open(&mut hostile).await);
+            if timeout(Duration::from_micros(1), of_hostile.message()).await.is_ok() {
+                return;
+            }
+        }
+    };
+    timeout(Duration::from_secs(20), ended).await.expect("the connection is closed");
+    timeout(Duration::from_millis(100), of_neighbour.message()).await.expect_err("the neighbour's stream goes on");
+    assert!(lists(&mut neighbour).await, "the neighbour pays for it");
+}
+
+#[tokio::test]
+async fn metadata_is_bounded() {
+    let server = server(DoorConfig::default());
+    let mut service = service(&server).await;
+    let with = |bytes: usize| {
+        let mut request = Request::new(pb::ListEnvironmentsRequest {});
+        for name in ["x-one", "x-two", "x-three", "x-four"] {
+            request.metadata_mut().insert(name, "a".repeat(bytes / 4).parse().expect("a value"));
+        }
+        request
+    };
+    service.list_environments(with(8 << 10)).await.expect("half is no matter");
+    for _ in 0..10 {
+        service.list_environments(with(24 << 10)).await.expect_err("more than there may be");
+    }
+    assert!(lists(&mut service).await, "it serves the next call");
+}

@@ -2,7 +2,7 @@
 
 use clap::{CommandFactory as _, FromArgMatches as _};
 use mazeway_server::{
-    ListenAddress, Listener, ServeError,
+    ListenAddress, Listener,
     config::{Cli, Command, PLACES, Settings, VARIABLES},
     serve,
 };
@@ -44,6 +44,9 @@ fn main() -> ExitCode {
     tracing_subscriber::fmt().with_env_filter(filter).with_writer(io::stderr).init();
     if let Err((error, hint)) = cli.limits.door.check_exposed(&cli.listen, cli.insecure) {
         return refuse(2, &error, hint);
+    }
+    if let Err(error) = cli.limits.door.check() {
+        return refuse(2, &error.to_string(), "see SECURITY.md for how such files are made");
     }
     // Connections are served by threads of their own: this one takes them in.
     let runtime = match tokio::runtime::Builder::new_current_thread().enable_all().build() {
@@ -88,9 +91,6 @@ async fn run(cli: Settings) -> ExitCode {
     let _ = writeln!(io::stdout(), "listening on {address}").and_then(|()| io::stdout().flush());
     match serve(cli.limits, listener, stop).await {
         Ok(()) => ExitCode::SUCCESS,
-        Err(ServeError::Door(error)) => {
-            refuse(2, &error.to_string(), "see 'server --help' for what the file should hold")
-        }
         Err(error) => refuse(1, &error.to_string(), "set MAZEWAY_LOG=info to see more"),
     }
 }

@@ -55,6 +55,7 @@ pub fn print(text: &str) -> Result<(), CliError> {
 pub async fn run(args: ServeArgs) -> Result<(), CliError> {
     let ServeArgs { config: _, listen, data, insecure, limits, door } = args;
     door.check_exposed(&listen, insecure).map_err(|(error, hint)| CliError::usage(error, hint))?;
+    door.check().map_err(mazeway_learner::ServeError::from)?;
     let data = data_directory(data)?;
     // A directory that cannot be used is said before the address is: who reads the line may connect.
     drop(Store::open(&data)?);

@@ -123,6 +123,15 @@ impl DoorConfig {
         Ok(self.tokens.as_deref().map(Keyring::open).transpose()?)
     }
 
+    /// Reads every file that the settings name, so that what is wrong with one is said before anybody is let in.
+    ///
+    /// # Errors
+    /// A file is missing or does not serve.
+    pub fn check(&self) -> Result<(), DoorError> {
+        self.acceptor()?;
+        self.keyring().map(|_| ())
+    }
+
     /// Whether a service may listen there: other machines reach it only if strangers can neither listen nor call.
     ///
     /// # Errors

@@ -11,7 +11,7 @@ mod maze;
 use criterion::{BatchSize, BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
 use mazeway_learner::irl::em_tied::Likelihood;
 use mazeway_learner::irl::{self, Basis, FitOptions, PosteriorKind, Problem};
-use mazeway_learner::statistics::Statistics;
+use mazeway_learner::statistics::{PackedIndices, Statistics};
 use rand_core::Rng;
 use rand_pcg::Pcg64;
 use std::ops::ControlFlow;
@@ -72,17 +72,27 @@ fn counting(criterion: &mut Criterion) {
     let (n_trajectories, steps) = (20_000, 50);
     for (n_states, n_actions) in [(57, 4), (2500, 4)] {
         let mut random = Pcg64::new(1, 2);
-        let mut packed = |below: u64| -> Vec<u8> {
-            (0..n_trajectories * steps).flat_map(|_| ((random.next_u64() % below) as u32).to_le_bytes()).collect()
+        let mut drawn = |below: u64| -> Vec<u16> {
+            (0..n_trajectories * steps).map(|_| (random.next_u64() % below) as u16).collect()
         };
-        let (states, actions) = (packed(n_states), packed(n_actions));
+        let (states, actions) = (drawn(n_states), drawn(n_actions));
+        // as the store keeps them, in the fewest bytes
+        let pairs: Vec<[u8; 2]> = states.iter().map(|s| s.to_le_bytes()).collect();
+        let bytes = |values: &[u16]| -> Vec<u8> { values.iter().map(|&v| v as u8).collect() };
+        let (small, actions) = (bytes(&states), bytes(&actions));
         group.throughput(Throughput::Elements((n_trajectories * steps) as u64));
         group.bench_function(format!("{n_states} states"), |bencher| {
             bencher.iter_batched_ref(
                 || Statistics::builder(n_states as usize, n_actions as usize, None),
                 |builder| {
-                    for (s, a) in states.chunks_exact(4 * steps).zip(actions.chunks_exact(4 * steps)) {
-                        builder.add_packed(s, a).expect("within the model");
+                    for (at, a) in actions.chunks_exact(steps).enumerate() {
+                        let range = at * steps..(at + 1) * steps;
+                        let s = if n_states <= 256 {
+                            PackedIndices::U8(&small[range])
+                        } else {
+                            PackedIndices::U16(&pairs[range])
+                        };
+                        builder.add_packed(s, PackedIndices::U8(a)).expect("within the model");
                     }
                 },
                 BatchSize::LargeInput,

@@ -24,6 +24,80 @@ pub struct StatisticsBuilder {
     n_trajectories: u64,
 }
 
+/// Indices as they are stored: little-endian, each in one, two or four bytes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum PackedIndices<'a> {
+    /// One byte each.
+    U8(&'a [u8]),
+    /// Two bytes each.
+    U16(&'a [[u8; 2]]),
+    /// Four bytes each.
+    U32(&'a [[u8; 4]]),
+}
+
+impl<'a> PackedIndices<'a> {
+    /// Of an array of 32-bit integers; bytes beyond the last whole one do not count.
+    #[must_use]
+    pub fn of_u32(bytes: &'a [u8]) -> Self {
+        Self::U32(bytes.as_chunks().0)
+    }
+
+    /// Number of indices.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        match self {
+            Self::U8(all) => all.len(),
+            Self::U16(all) => all.len(),
+            Self::U32(all) => all.len(),
+        }
+    }
+
+    /// Whether there are none.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// The indices themselves.
+    #[must_use]
+    pub fn to_vec(&self) -> Vec<u32> {
+        match self {
+            Self::U8(all) => all.iter().map(Packed::index).collect(),
+            Self::U16(all) => all.iter().map(Packed::index).collect(),
+            Self::U32(all) => all.iter().map(Packed::index).collect(),
+        }
+    }
+}
+
+/// An index, however it is kept.
+trait Packed {
+    fn index(&self) -> u32;
+}
+
+impl Packed for u8 {
+    fn index(&self) -> u32 {
+        u32::from(*self)
+    }
+}
+
+impl Packed for [u8; 2] {
+    fn index(&self) -> u32 {
+        u32::from(u16::from_le_bytes(*self))
+    }
+}
+
+impl Packed for [u8; 4] {
+    fn index(&self) -> u32 {
+        u32::from_le_bytes(*self)
+    }
+}
+
+impl Packed for u32 {
+    fn index(&self) -> u32 {
+        *self
+    }
+}
+
 /// Why a trajectory or a model does not fit the statistics.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum StatisticsError {
@@ -81,7 +155,7 @@ impl StatisticsBuilder {
         if !trajectory.has_actions() {
             return self.add_states(trajectory);
         }
-        self.add_steps(trajectory.states(), trajectory.actions(), |&index| index)
+        self.add_steps(trajectory.states(), trajectory.actions())
     }
 
     /// Counts the transitions of a trajectory whose actions were not seen.
@@ -97,22 +171,29 @@ impl StatisticsBuilder {
         Ok(())
     }
 
-    /// Counts a trajectory as it is stored: states and actions packed as little-endian 32-bit integers, without unpacking
-    /// them first. Of arrays that differ in length, what goes beyond the shorter one does not count; without a step there is
-    /// no trajectory. States alone go through [`StatisticsBuilder::add`].
+    /// Counts a trajectory as it is stored, without unpacking it first. Of arrays that differ in length, what goes beyond the
+    /// shorter one does not count; without a step there is no trajectory. States alone go through
+    /// [`StatisticsBuilder::add`].
     ///
     /// # Errors
     /// As [`StatisticsBuilder::add`].
-    pub fn add_packed(&mut self, states: &[u8], actions: &[u8]) -> Result<(), StatisticsError> {
-        self.add_steps(states.as_chunks().0, actions.as_chunks().0, |&bytes| u32::from_le_bytes(bytes))
+    pub fn add_packed(&mut self, states: PackedIndices<'_>, actions: PackedIndices<'_>) -> Result<(), StatisticsError> {
+        match states {
+            PackedIndices::U8(states) => self.add_beside(states, actions),
+            PackedIndices::U16(states) => self.add_beside(states, actions),
+            PackedIndices::U32(states) => self.add_beside(states, actions),
+        }
     }
 
-    fn add_steps<T>(
-        &mut self,
-        states: &[T],
-        actions: &[T],
-        index: impl Fn(&T) -> u32 + Copy,
-    ) -> Result<(), StatisticsError> {
+    fn add_beside<S: Packed>(&mut self, states: &[S], actions: PackedIndices<'_>) -> Result<(), StatisticsError> {
+        match actions {
+            PackedIndices::U8(actions) => self.add_steps(states, actions),
+            PackedIndices::U16(actions) => self.add_steps(states, actions),
+            PackedIndices::U32(actions) => self.add_steps(states, actions),
+        }
+    }
+
+    fn add_steps<S: Packed, A: Packed>(&mut self, states: &[S], actions: &[A]) -> Result<(), StatisticsError> {
         let n = states.len().min(actions.len()).min(self.horizon);
         if n == 0 {
             return Ok(());
@@ -120,9 +201,9 @@ impl StatisticsBuilder {
         let (states, actions) = (&states[..n], &actions[..n]);
         let (n_states, n_actions) = (self.n_states, self.n_actions);
         // two plain maxima first: nothing may be counted of a trajectory that is refused
-        let largest = |values: &[T]| values.iter().map(index).fold(0, u32::max) as usize;
         if largest(states) >= n_states || largest(actions) >= n_actions {
-            for (step, (state, action)) in states.iter().map(index).zip(actions.iter().map(index)).enumerate() {
+            let pairs = states.iter().map(Packed::index).zip(actions.iter().map(Packed::index));
+            for (step, (state, action)) in pairs.enumerate() {
                 if state as usize >= n_states || action as usize >= n_actions {
                     return Err(StatisticsError::OutOfRange { n_states, n_actions, state, action, step });
                 }
@@ -134,7 +215,7 @@ impl StatisticsBuilder {
         let n_pairs = n_states.saturating_mul(n_actions);
         for (counts, (state, action)) in self.steps.iter_mut().zip(states.iter().zip(actions)) {
             // no model has more pairs than 32 bits count, so whatever wraps is refused with its model
-            counts.add(index(state).wrapping_mul(n_actions as u32).wrapping_add(index(action)), n_pairs);
+            counts.add(state.index().wrapping_mul(n_actions as u32).wrapping_add(action.index()), n_pairs);
         }
         self.n_trajectories += 1;
         Ok(())
@@ -168,6 +249,10 @@ impl StatisticsBuilder {
             latent: self.latent.finish(),
         })
     }
+}
+
+fn largest<T: Packed>(values: &[T]) -> usize {
+    values.iter().map(Packed::index).fold(0, u32::max) as usize
 }
 
 /// Counts of demonstrated state-action pairs, per step, and of transitions whose actions were not seen apart from them.
@@ -344,7 +429,17 @@ mod tests {
                     *naive[k].entry(s * n_actions + a).or_default() += 1.0;
                 }
                 let bytes = |values: &[u32]| values.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>();
-                packed.add_packed(&bytes(&states), &bytes(&actions)).expect("counted");
+                let small = |values: &[u32]| values.iter().map(|&v| v as u8).collect::<Vec<_>>();
+                let (wide, small, small_actions) = (bytes(&states), small(&states), small(&actions));
+                let half = states.iter().map(|&s| (s as u16).to_le_bytes()).collect::<Vec<_>>();
+                // however they are kept, in turn
+                let kept = match states.len() % 3 {
+                    0 => PackedIndices::of_u32(&wide),
+                    1 => PackedIndices::U16(half.as_slice()),
+                    _ => PackedIndices::U8(&small),
+                };
+                prop_assert_eq!((&kept.to_vec(), kept.len()), (&states, states.len()));
+                packed.add_packed(kept, PackedIndices::U8(&small_actions)).expect("counted");
                 builder.add(&Trajectory::new(states, actions, None, n_states, n_actions).expect("a trajectory"))
                     .expect("counted");
             }
@@ -369,9 +464,8 @@ mod tests {
         assert_eq!(builder.steps.iter().map(Counts::bytes).sum::<usize>(), before);
         // a long trajectory that never comes back does not take the whole model a step
         let states: Vec<u32> = (0..3000).collect();
-        builder
-            .add_packed(&states.iter().flat_map(|s| s.to_le_bytes()).collect::<Vec<u8>>(), &[0; 12000])
-            .expect("counted");
+        let states = states.iter().flat_map(|s| s.to_le_bytes()).collect::<Vec<u8>>();
+        builder.add_packed(PackedIndices::of_u32(&states), PackedIndices::U8(&[0; 3000])).expect("counted");
         assert!(builder.steps.iter().map(Counts::bytes).sum::<usize>() < 3000 * 200);
     }
 
@@ -382,8 +476,7 @@ mod tests {
         let before = builder.clone().finish();
         assert!(matches!(builder.add(&trajectory(&[0, 3], &[0, 0])), Err(StatisticsError::OutOfRange { step: 1, .. })));
         assert!(matches!(builder.add(&trajectory(&[0, 2], &[0, 2])), Err(StatisticsError::OutOfRange { step: 1, .. })));
-        let packed = |values: [u32; 2]| values.map(u32::to_le_bytes).concat();
-        let refused = builder.add_packed(&packed([0, 3]), &packed([0, 0]));
+        let refused = builder.add_packed(PackedIndices::U16(&[[0, 0], [3, 0]]), PackedIndices::U8(&[0, 0]));
         assert!(matches!(refused, Err(StatisticsError::OutOfRange { step: 1, state: 3, .. })));
         assert_eq!(builder.finish(), before);
         assert_eq!(Statistics::builder(3, 2, None).finish(), Err(StatisticsError::Empty));

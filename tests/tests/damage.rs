@@ -135,8 +135,10 @@ fn a_flipped_bit_in_a_trajectory_is_named() {
     let directory = memory();
     let (recordings, mut bytes) = store(directory.path());
     let victim = &recordings[25];
-    let states = victim.arrays().states.slice(400..440);
-    let at = bytes.windows(40).position(|window| window == states).expect("its states");
+    // A thousand states: two bytes each.
+    let states =
+        victim.arrays().states.as_chunks::<4>().0[100..110].iter().flat_map(|s| [s[0], s[1]]).collect::<Vec<_>>();
+    let at = bytes.windows(20).position(|window| window == states).expect("its states");
     bytes[at] ^= 2;
     fs::write(directory.path().join(FILE_NAME), &bytes).expect("a file");
     let found = store::verify(directory.path()).expect("findings");

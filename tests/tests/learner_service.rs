@@ -13,6 +13,7 @@ use mazeway_tests::{
     learner::{LearnerServer, export, trajectory},
 };
 use serde_json::Value;
+use sha2::{Digest as _, Sha256};
 use std::{path::Path, time::Duration};
 use tempfile::TempDir;
 use tokio::time::timeout;
@@ -339,7 +340,7 @@ async fn fits_over_the_wire_reproduce_the_reference_and_are_kept() {
             assert!((w - e).abs() < 1e-6, "{} {state}: expected {e}, got {w}", case["m_step"]);
         }
         assert_eq!((fit.env_id.as_str(), fit.style.as_str()), ("Maze-v0", "goals"));
-        assert_eq!((&fit.model_id, fit.trajectory_ids.len(), fit.steps), (&model.model_id, 20, 1000));
+        assert_eq!((&fit.model_id, fit.trajectories, fit.steps), (&model.model_id, 20, 1000));
         assert_eq!(fit.trace.len(), fit.iterations as usize);
         let visits = Packed::<f64>::new(fit.state_visits.clone()).expect("an array");
         assert_eq!(visits.iter().sum::<f64>(), 1000.0);
@@ -434,10 +435,38 @@ async fn a_fit_without_what_it_needs_is_refused() {
         ..request("bc", "goals")
     };
     let fit = learner.fit(request, |_| ()).await.expect("a fit");
-    assert_eq!((fit.trajectory_ids.len(), fit.steps), (10, 50));
+    assert_eq!((fit.trajectories, fit.steps, fit.longest), (10, 50, 5));
+    let pairs = Packed::<f64>::new(fit.pair_visits.clone()).expect("an array");
+    assert_eq!((pairs.len(), pairs.iter().sum::<f64>()), (57 * 4, 50.0));
     let filter = pb::TrajectoryFilter { style: "goals".into(), ..Default::default() };
     let first = learner.list_trajectories_page(&filter, 10, "").await.expect("a page").trajectories;
-    assert!(first.iter().map(|t| &t.trajectory_id).eq(&fit.trajectory_ids));
+    let used = learner.fit_trajectories(&fit.fit_id).await.expect("ids");
+    assert!(first.iter().map(|t| &t.trajectory_id).eq(&used));
+    let bytes = used.iter().flat_map(|id| Uuid::parse_str(id).expect("an id").into_bytes()).collect::<Vec<u8>>();
+    assert_eq!(fit.trajectories_digest[..], Sha256::digest(bytes)[..]);
+    assert_eq!(fit.sources.iter().map(|s| s.trajectories).sum::<u64>(), 10);
+    // Page by page, and whole, what is left of them.
+    let page = learner.fit_trajectories_page(&fit.fit_id[..8], 4, "").await.expect("a page");
+    assert_eq!((&page.trajectory_ids[..], page.total), (&used[..4], 10));
+    let page = learner.fit_trajectories_page(&fit.fit_id[..8], 4, &page.next_page_token).await.expect("a page");
+    assert_eq!(page.trajectory_ids, used[4..8]);
+    let last = learner.fit_trajectories_page(&fit.fit_id[..8], 4, &page.next_page_token).await.expect("a page");
+    assert_eq!((&last.trajectory_ids[..], last.next_page_token.as_str()), (&used[8..], ""));
+    let gone = pb::TrajectoryFilter { trajectory_ids: vec![used[3].clone()], ..Default::default() };
+    assert_eq!(learner.delete_trajectories(&gone).await.expect("a deletion"), 1);
+    let mut stream = learner.export_fit_trajectories(&fit.fit_id, &filter).await.expect("an export");
+    let mut left = Vec::new();
+    while let Some(part) = stream.next().await.expect("a page") {
+        left.extend(part.into_iter().map(|t| t.trajectory_id));
+    }
+    assert!(left.iter().eq(used.iter().filter(|&id| *id != used[3])));
+    let nobody = Uuid::nil().to_string();
+    for (id, code) in [(nobody.as_str(), Code::NotFound), ("zz", Code::InvalidArgument)] {
+        let error = learner.fit_trajectories(id).await.expect_err("no fit");
+        assert_eq!(blame(&error), (code, "fit_id".into()));
+        let error = learner.export_fit_trajectories(id, &filter).await.err().expect("no fit");
+        assert_eq!(blame(&error), (code, "fit_id".into()));
+    }
 }
 
 /// A model in which every state leads to every other, more likely to those that follow it.

@@ -1,6 +1,7 @@
 //! Stored data outlives releases and is shared between processes.
 
 use mazeway_client::{Learner, Options, Recorder, packed::Packed};
+use mazeway_learner::store;
 use mazeway_proto::learner as pb;
 use mazeway_tests::{
     EnvServer,
@@ -12,8 +13,11 @@ use std::path::{Path, PathBuf};
 /// Trajectories in the sample.
 const SAMPLE: u128 = 12;
 
-fn sample() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("data").join("store_v1.sqlite3")
+/// The newest schema.
+const NEWEST: u32 = 2;
+
+fn sample(schema: u32) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("data").join(format!("store_v{schema}.sqlite3"))
 }
 
 /// A trajectory of the sample: in the maze's model, so that it can be fitted.
@@ -41,13 +45,26 @@ async fn write_the_sample() {
     learner.fit(request, |_| ()).await.expect("a fit");
     drop(learner);
     server.stop();
-    std::fs::copy(data.path().join("mazeway.sqlite3"), sample()).expect("a copy");
+    std::fs::copy(data.path().join("mazeway.sqlite3"), sample(NEWEST)).expect("a copy");
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_store_of_the_first_release_reads_and_goes_on() {
+async fn a_store_of_every_schema_reads_and_goes_on() {
+    for schema in 1..=NEWEST {
+        reads_and_goes_on(&sample(schema)).await;
+    }
+}
+
+async fn reads_and_goes_on(sample: &Path) {
     let data = tempfile::tempdir().expect("a directory");
-    std::fs::copy(sample(), data.path().join("mazeway.sqlite3")).expect("a copy");
+    let file = data.path().join("mazeway.sqlite3");
+    std::fs::copy(sample, &file).expect("a copy");
+    // As it is, before anything brings it up to date.
+    let found = store::verify(data.path()).expect("a store");
+    let sound = |found: &store::Verification| {
+        (found.is_sound(), found.trajectories.sound, found.models.sound, found.fits.sound)
+    };
+    assert_eq!(sound(&found), (true, SAMPLE as u64, 1, 1), "{found:?}");
     let server = LearnerServer::start(data.path());
     let learner = server.client().await;
     let models = learner.list_models("").await.expect("models");
@@ -59,7 +76,8 @@ async fn a_store_of_the_first_release_reads_and_goes_on() {
     assert_eq!(fits.len(), 1);
     let old = learner.get_fit(&fits[0].fit_id).await.expect("a fit");
     let ids = expected.iter().map(|t| &t.trajectory_id);
-    assert!(old.trajectory_ids.iter().eq(ids));
+    assert!(learner.fit_trajectories(&old.fit_id).await.expect("ids").iter().eq(ids));
+    assert_eq!(old.trajectories, SAMPLE as u64);
     // The stored request repeats the fit.
     let again = learner.fit(old.request.clone().expect("a request"), |_| ()).await.expect("a fit");
     let weights = |fit: &pb::Fit| Packed::<f64>::new(fit.weights.clone()).expect("an array").to_vec();
@@ -74,6 +92,31 @@ async fn a_store_of_the_first_release_reads_and_goes_on() {
     }
     let receipt = recorder.finish().await.expect("everything stored");
     assert_eq!((receipt.stored, receipt.duplicates), (1, SAMPLE as u64));
+    assert_eq!((again.trajectories, &again.trajectories_digest), (old.trajectories, &old.trajectories_digest));
+    drop(learner);
+    server.stop();
+    let found = store::verify(data.path()).expect("a store");
+    assert_eq!((sound(&found), found.schema), ((true, SAMPLE as u64 + 1, 1, 2), i64::from(NEWEST)), "{found:?}");
+}
+
+#[test]
+fn a_damaged_store_of_the_first_schema_is_repaired_into_the_newest() {
+    let data = tempfile::tempdir().expect("a directory");
+    let file = data.path().join("mazeway.sqlite3");
+    let mut bytes = std::fs::read(sample(1)).expect("a sample");
+    let victim = sampled(7, "");
+    let at = bytes.windows(victim.states.len()).position(|w| w == victim.states).expect("its states");
+    bytes[at] ^= 1;
+    std::fs::write(&file, bytes).expect("a copy");
+    let repair = store::repair(data.path()).expect("a repair");
+    assert_eq!((repair.found.trajectories.damaged, repair.found.fits.sound), (1, 1), "{:?}", repair.found);
+    assert_eq!(repair.found.damage[0].name, victim.trajectory_id);
+    let found = store::verify(data.path()).expect("a store");
+    assert!(found.is_sound() && found.schema == i64::from(NEWEST), "{found:?}");
+    let store = store::Store::open(data.path()).expect("a store");
+    let fit = store.fits("", "", i64::MAX, 10).expect("fits").remove(0);
+    let (ids, total) = store.fit_trajectories(&fit.fit_id, 0, 100).expect("ids").expect("a fit");
+    assert_eq!((ids.len(), total), (SAMPLE as usize, SAMPLE as u64), "what it used, whether it is left or not");
 }
 
 #[tokio::test(flavor = "multi_thread")]

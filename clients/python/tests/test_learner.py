@@ -1,6 +1,7 @@
 """Recording and learning, end to end against a real learner."""
 
 import datetime
+import hashlib
 import pickle
 import signal
 import uuid
@@ -226,6 +227,12 @@ def test_act_draws_as_told(learner, style):
     learner.record([demonstration])
     fit = learner.fit("Toy-v0", style, method="bc")
     np.testing.assert_allclose(fit.policy[0], [0.75, 0.25])
+    used = list(learner.fit_trajectories(fit.fit_id[:8]))
+    assert len(used) == fit.trajectories == sum(fit.sources.values())
+    assert fit.trajectories_digest == hashlib.sha256(b"".join(uuid.UUID(i).bytes for i in used)).digest()
+    assert [t.trajectory_id for t in learner.trajectories(fit_id=fit.fit_id)] == used
+    with pytest.raises(mazeway.NotFoundError):
+        list(learner.fit_trajectories(str(uuid.UUID(int=0))))
     draws = fit.act(np.zeros(20_000, int), rng=np.random.default_rng(1), stochastic=True)
     assert np.mean(draws) == pytest.approx(0.25, abs=0.02)
     assert fit.act(np.zeros((2, 3), int)).tolist() == [[0, 0, 0], [0, 0, 0]]

@@ -7,6 +7,7 @@ use super::{
     unreachable,
 };
 use mazeway_client::{ClientError, Learner};
+use std::path::PathBuf;
 
 /// A connection, and the guard of what was started for it.
 pub struct Connected {
@@ -28,7 +29,15 @@ pub async fn connect(store: &StoreArgs) -> Result<Connected, CliError> {
         })?;
         return Ok(Connected { learner, embedded: None });
     }
-    let service = embedded::learner(&data_directory(store.data.clone())?).await?;
+    connect_to_data(store.data.clone()).await
+}
+
+/// Starts a learner service on a data directory, else on the platform's, and connects to it.
+///
+/// # Errors
+/// The data directory cannot be used.
+pub async fn connect_to_data(data: Option<PathBuf>) -> Result<Connected, CliError> {
+    let service = embedded::learner(&data_directory(data)?).await?;
     let learner = Learner::connect(&service.address()).await?;
     Ok(Connected { learner, embedded: Some(service) })
 }

@@ -62,6 +62,9 @@ enum Format {
 pub struct ExportArgs {
     #[command(flatten)]
     filter: FilterArgs,
+    /// What this fit used alone; its id, or the first eight or more characters of it
+    #[arg(long, value_name = "FIT")]
+    fit: Option<String>,
     /// How
     #[arg(long, value_enum, default_value_t = Format::Jsonl, value_name = "FORMAT")]
     format: Format,
@@ -96,7 +99,17 @@ enum Sink {
 
 async fn write(args: &ExportArgs, learner: &Learner, mut out: Box<dyn Write + Send>) -> Result<(), CliError> {
     let mut labels = Labels { wanted: args.labels, models: BTreeMap::new() };
-    let mut pages = learner.export_trajectories(&args.filter.filter()).await?;
+    let filter = args.filter.filter();
+    let mut pages = match &args.fit {
+        None => learner.export_trajectories(&filter).await?,
+        Some(fit) => learner.export_fit_trajectories(fit, &filter).await.map_err(|error| match error.code() {
+            Code::NotFound => CliError::failure(format!("there is no fit '{fit}'"), "see the fits with 'learner list'"),
+            Code::InvalidArgument if error.field() == Some("fit_id") => {
+                CliError::usage(error.to_string(), "see the fits with 'learner list'")
+            }
+            _ => error.into(),
+        })?,
+    };
     if args.format == Format::Csv {
         writeln!(out, "{}", COLUMNS.join(","))?;
     }

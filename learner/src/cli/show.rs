@@ -157,7 +157,9 @@ fn fit_json(fit: &pb::Fit, names: &(Names, Names)) -> Result<Value, CliError> {
         "model": fit.model_id,
         "n_states": fit.n_states,
         "n_actions": fit.n_actions,
-        "trajectories": fit.trajectory_ids,
+        "trajectories": fit.trajectories,
+        "trajectories_digest": hexadecimal(&fit.trajectories_digest),
+        "sources": fit.sources.iter().map(|s| json!({"source": s.source, "trajectories": s.trajectories})).collect::<Vec<_>>(),
         "steps": fit.steps,
         "stopped": stopped(fit.stopped),
         "iterations": fit.iterations,
@@ -180,6 +182,10 @@ fn fit_json(fit: &pb::Fit, names: &(Names, Names)) -> Result<Value, CliError> {
         "state_visits": array(&fit.state_visits, s, "the state visits")?,
         "trace": trace.collect::<Vec<_>>(),
     }))
+}
+
+fn hexadecimal(bytes: &[u8]) -> String {
+    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
 /// Intervals of the weights; null where the method has none.
@@ -227,7 +233,8 @@ fn fit_text(fit: &pb::Fit, names: &(Names, Names)) -> Result<String, CliError> {
         ("method", request.method),
         ("options", options),
         ("model", format!("{} ({} states, {} actions)", fit.model_id, fit.n_states, fit.n_actions)),
-        ("data", format!("{} trajectories, {} steps", fit.trajectory_ids.len(), fit.steps)),
+        ("data", format!("{} trajectories, {} steps", fit.trajectories, fit.steps)),
+        ("data's digest", hexadecimal(&fit.trajectories_digest)),
         ("states covered", format!("{} of {}", fit.states_covered, fit.n_states)),
         ("agreement", format!("{:.3} of the demonstrated steps", fit.agreement)),
         ("log-likelihood", format!("{:.4} a step", fit.log_likelihood_per_step)),

@@ -90,7 +90,7 @@ async fn run(
         let events = events.clone();
         move || events.is_closed() || aborting.is_cancelled()
     };
-    let fit = blocking({
+    let (fit, ids) = blocking({
         let (events, cancelled) = (events.clone(), cancelled.clone());
         move || {
             let mut last: Option<Instant> = None;
@@ -113,7 +113,7 @@ async fn run(
         return Err(CallError::Cancelled);
     }
     let mut unstored = fit.clone();
-    match store.put_fit(fit).await {
+    match store.put_fit(fit, ids).await {
         Err(error @ StoreError::DiskFull { .. }) => {
             // What was worked out is given all the same.
             tracing::warn!(%error, fit_id = unstored.fit_id, "a fit could not be stored");

@@ -7,12 +7,21 @@ use crate::{
     irl::{self, BasisKind, FitError, FitOptions, LatentActions, Method, Problem, TraceEntry},
     mdp::{Features, TabularMdp},
     statistics::{Statistics, StatisticsBuilder},
-    store::{FieldError, Filter, Model, Recording, Store, check_model_id, clip, pack_f64, unpack_f64, unpack_u32},
+    store::{
+        Collection, FieldError, Filter, IdList, Model, Store, Stored, check_model_id, clip, pack_f64, unpack_f64,
+        unpack_u32,
+    },
     trajectory::Demonstrations,
 };
 use mazeway_proto::{env::FeatureDomain, learner as pb};
 use std::{ops::ControlFlow, time::Instant};
 use uuid::Uuid;
+
+/// Trajectories after which a fit looks whether its caller has gone.
+const CANCELLED_EVERY: u64 = 64;
+
+/// Sources that a fit names at most.
+const MAX_SOURCES: usize = 1000;
 
 /// What a fit is asked to do.
 pub struct FitJob {
@@ -24,7 +33,8 @@ pub struct FitJob {
 
 /// The demonstrations of a fit, counted.
 struct Data {
-    trajectory_ids: Vec<String>,
+    ids: IdList,
+    sources: Vec<pb::FitSource>,
     statistics: Statistics,
     demonstrations: Option<Demonstrations>,
     env_id: String,
@@ -56,14 +66,14 @@ impl FitJob {
         Ok(Self { request, method, filter, options })
     }
 
-    /// Reads the data, fits, and says everything that is worth storing. Calls `progress` after every iteration and asks
-    /// `cancelled` between trajectories; blocks.
+    /// Reads the data, fits, and says everything that is worth storing, and the ids of the trajectories used. Calls
+    /// `progress` after every iteration and asks `cancelled` between trajectories; blocks.
     pub fn run(
         self,
         store: &Store,
         mut progress: impl FnMut(&TraceEntry) -> ControlFlow<()>,
         cancelled: impl Fn() -> bool,
-    ) -> Result<pb::Fit, CallError> {
+    ) -> Result<(pb::Fit, IdList), CallError> {
         let load = |model_id: &str| {
             store.model(model_id)?.ok_or_else(|| CallError::NotFound {
                 field: "model_id",
@@ -93,28 +103,24 @@ impl FitJob {
             (_, BasisKind::Features) => self.options.features.clone(),
             _ => Vec::new(),
         };
-        let mut described = self.describe(&model, data, &fit, judged, begun.elapsed().as_secs_f64());
+        let mut described = self.describe(&model, &data, &fit, judged, begun.elapsed().as_secs_f64());
         described.feature_names = feature_names;
         described.warnings.extend(unseen_pairs(&model));
-        Ok(described)
+        Ok((described, data.ids))
     }
 
     /// Streams the trajectories through the counts.
     fn gather(&self, store: &Store, cancelled: impl Fn() -> bool) -> Result<Data, CallError> {
-        let mut gathering = Gathering::new(self);
-        let wanted = self.request.max_trajectories as usize;
-        let outcome = store.for_each(&self.filter, |recording| {
-            if cancelled() {
+        let mut gathering = Gathering::new(self, store.id_list());
+        let wanted = u64::from(self.request.max_trajectories);
+        let outcome = store.for_each(&self.filter, |stored| {
+            if gathering.ids.len().is_multiple_of(CANCELLED_EVERY) && cancelled() {
                 return ControlFlow::Break(Err(CallError::Cancelled));
             }
-            if let Err(error) = gathering.add(&recording) {
+            if let Err(error) = gathering.add(stored) {
                 return ControlFlow::Break(Err(error));
             }
-            if gathering.trajectory_ids.len() == wanted {
-                ControlFlow::Break(Ok(()))
-            } else {
-                ControlFlow::Continue(())
-            }
+            if gathering.ids.len() == wanted { ControlFlow::Break(Ok(())) } else { ControlFlow::Continue(()) }
         })?;
         if let ControlFlow::Break(Err(error)) = outcome {
             return Err(error);
@@ -122,17 +128,19 @@ impl FitJob {
         gathering.finish()
     }
 
-    fn describe(self, model: &Model, data: Data, fit: &irl::Fit, judged: Judged, fit_secs: f64) -> pb::Fit {
-        pb::Fit {
+    fn describe(self, model: &Model, data: &Data, fit: &irl::Fit, judged: Judged, fit_secs: f64) -> pb::Fit {
+        let mut described = pb::Fit {
             fit_id: Uuid::new_v4().to_string(),
             created_at: None,
             version: env!("CARGO_PKG_VERSION").into(),
-            env_id: data.env_id,
-            style: data.style,
+            env_id: data.env_id.clone(),
+            style: data.style.clone(),
             model_id: model.model_id().into(),
             n_states: model.header().n_states,
             n_actions: model.header().n_actions,
-            trajectory_ids: data.trajectory_ids,
+            sources: data.sources.clone(),
+            pair_visits: pack_f64(&data.statistics.counts(None)),
+            longest: data.statistics.longest(),
             steps: data.statistics.n_steps(None),
             weights: pack_f64(&fit.weights),
             posterior: fit.posterior.as_ref().map(posterior_message),
@@ -153,7 +161,10 @@ impl FitJob {
             agreement: judged.agreement,
             states_covered: data.statistics.states_covered(None) as u32,
             request: Some(self.request),
-        }
+            ..pb::Fit::default()
+        };
+        data.ids.describe(&mut described);
+        described
     }
 }
 
@@ -230,69 +241,88 @@ struct Gathering<'a> {
     job: &'a FitJob,
     builder: Option<StatisticsBuilder>,
     demonstrations: Option<Demonstrations>,
-    trajectory_ids: Vec<String>,
+    ids: IdList,
+    sources: Vec<pb::FitSource>,
     /// Of the first trajectory; a label in which another one differs is emptied.
-    first: crate::store::Collection,
+    first: Collection,
+    /// The collection of the last trajectory, and its source's rank.
+    last: Option<(i64, usize)>,
 }
 
 impl<'a> Gathering<'a> {
-    fn new(job: &'a FitJob) -> Self {
+    fn new(job: &'a FitJob, ids: IdList) -> Self {
         Self {
             job,
             builder: None,
             demonstrations: job.method.needs_demonstrations().then(Demonstrations::default),
-            trajectory_ids: Vec::new(),
-            first: crate::store::Collection::default(),
+            ids,
+            sources: Vec::new(),
+            first: Collection::default(),
+            last: None,
         }
     }
 
-    fn add(&mut self, recording: &Recording) -> Result<(), CallError> {
-        let collection = recording.collection();
+    fn add(&mut self, stored: &Stored<'_>) -> Result<(), CallError> {
+        let source = match self.last {
+            Some((row, source)) if row == stored.collection_row() => source,
+            _ => self.enter(stored)?,
+        };
+        let corrupt = |e: &dyn std::fmt::Display| CallError::Internal(format!("trajectory {}: {e}", stored.id()));
+        let (states, actions) = (stored.states(), stored.actions());
+        if let (true, Some(builder)) =
+            (self.demonstrations.is_none() && states.len() == actions.len(), &mut self.builder)
+        {
+            // as they are stored: nothing is unpacked or kept
+            builder.add_packed(states, actions).map_err(|e| corrupt(&e))?;
+        } else {
+            let trajectory = stored.recording().trajectory().map_err(|e| corrupt(&e))?;
+            if let Some(builder) = &mut self.builder {
+                builder.add(&trajectory).map_err(|e| corrupt(&e))?;
+            }
+            if let Some(demonstrations) = &mut self.demonstrations {
+                demonstrations.push(match self.job.options.horizon {
+                    Some(horizon) => trajectory.truncated(horizon as usize),
+                    None => trajectory,
+                });
+            }
+        }
+        if let Some(source) = self.sources.get_mut(source) {
+            source.trajectories += 1;
+        }
+        Ok(self.ids.push(stored.id())?)
+    }
+
+    /// A trajectory that has not all in common with the last one. Returns its source's rank.
+    fn enter(&mut self, stored: &Stored<'_>) -> Result<usize, CallError> {
+        let collection = stored.collection();
         if self.builder.is_none() {
             let (n_states, n_actions) = (collection.n_states as usize, collection.n_actions as usize);
             self.builder = Some(Statistics::builder(n_states, n_actions, self.job.options.horizon));
             self.first = collection.clone();
         }
-        self.check_same_process(recording)?;
+        self.check_same_process(stored)?;
         if self.first.env_id != collection.env_id {
             self.first.env_id.clear();
         }
         if self.first.style != collection.style {
             self.first.style.clear();
         }
-        let corrupt = |e: &dyn std::fmt::Display| CallError::Internal(format!("trajectory {}: {e}", recording.id()));
-        let arrays = recording.arrays();
-        let counts_alone = self.demonstrations.is_none() && arrays.states.len() == arrays.actions.len();
-        if let (true, Some(builder)) = (counts_alone, &mut self.builder) {
-            // as they are stored: nothing is unpacked or kept
-            builder.add_packed(&arrays.states, &arrays.actions).map_err(|e| corrupt(&e))?;
-            self.trajectory_ids.push(recording.id().to_string());
-            return Ok(());
+        let known = self.sources.iter().position(|known| known.source == collection.source);
+        let source = known.unwrap_or(self.sources.len());
+        if source == self.sources.len() && source < MAX_SOURCES {
+            self.sources.push(pb::FitSource { source: collection.source.clone(), trajectories: 0 });
         }
-        let trajectory = recording.trajectory().map_err(|e| corrupt(&e))?;
-        if let Some(builder) = &mut self.builder {
-            builder.add(&trajectory).map_err(|e| corrupt(&e))?;
-        }
-        if let Some(demonstrations) = &mut self.demonstrations {
-            demonstrations.push(match self.job.options.horizon {
-                Some(horizon) => trajectory.truncated(horizon as usize),
-                None => trajectory,
-            });
-        }
-        self.trajectory_ids.push(recording.id().to_string());
-        Ok(())
+        self.last = Some((stored.collection_row(), source));
+        Ok(source)
     }
 
     /// One fit, one process: the model that is asked for, or the one that all trajectories name.
-    fn check_same_process(&self, recording: &Recording) -> Result<(), CallError> {
-        let (first, this) = (&self.first, recording.collection());
+    fn check_same_process(&self, stored: &Stored<'_>) -> Result<(), CallError> {
+        let (first, this) = (&self.first, stored.collection());
         let refuse = |kind, message| Err(CallError::Precondition { kind, field: "model_id", message });
         if self.job.request.model_id.is_empty() {
             if this.model_id.is_empty() {
-                return refuse(
-                    "NO_MODEL",
-                    format!("trajectory {} names no model, and none is asked for", recording.id()),
-                );
+                return refuse("NO_MODEL", format!("trajectory {} names no model, and none is asked for", stored.id()));
             }
             if this.model_id != first.model_id {
                 let message = format!(
@@ -313,7 +343,7 @@ impl<'a> Gathering<'a> {
     }
 
     fn finish(self) -> Result<Data, CallError> {
-        let (wanted, found) = (self.job.request.max_trajectories as usize, self.trajectory_ids.len());
+        let (wanted, found) = (u64::from(self.job.request.max_trajectories), self.ids.len());
         let missing = |message| CallError::Precondition { kind: "TOO_FEW_TRAJECTORIES", field: "filter", message };
         let Some(builder) = self.builder else {
             let wanted = wanted.max(1);
@@ -323,7 +353,8 @@ impl<'a> Gathering<'a> {
             return Err(missing(format!("expected at least {wanted} trajectories, the filter selects {found}")));
         }
         Ok(Data {
-            trajectory_ids: self.trajectory_ids,
+            ids: self.ids,
+            sources: self.sources,
             statistics: builder.finish().map_err(|e| CallError::Internal(e.to_string()))?,
             demonstrations: self.demonstrations,
             env_id: self.first.env_id,

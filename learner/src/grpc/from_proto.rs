@@ -144,6 +144,11 @@ pub fn fit_prefix(text: &str) -> Result<String, FieldError> {
     Ok(text.to_ascii_lowercase())
 }
 
+/// As [`fit_prefix`], or nothing.
+pub fn optional_fit_prefix(text: &str) -> Result<Option<String>, FieldError> {
+    if text.is_empty() { Ok(None) } else { fit_prefix(text).map(Some) }
+}
+
 /// A fit's whole id.
 pub fn fit_id(text: &str) -> Result<String, FieldError> {
     Ok(uuid("fit_id", text)?.to_string())

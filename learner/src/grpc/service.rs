@@ -176,8 +176,15 @@ impl LearnerService for LearnerGrpc {
         &self,
         request: Request<pb::ExportTrajectoriesRequest>,
     ) -> Result<Response<Self::ExportTrajectoriesStream>, Status> {
-        let filter = from_proto::filter(request.into_inner().filter).map_err(CallError::from)?;
-        let mut cursor = self.read(move |store| Ok(store.cursor(&filter)?)).await?;
+        let request = request.into_inner();
+        let filter = from_proto::filter(request.filter).map_err(CallError::from)?;
+        let fit = from_proto::optional_fit_prefix(&request.fit_id).map_err(CallError::from)?;
+        let mut cursor = self
+            .read(move |store| match fit {
+                None => Ok(store.cursor(&filter)?),
+                Some(id) => store.fit_cursor(&id, &filter)?.ok_or_else(|| no_fit(id)),
+            })
+            .await?;
         let (pages, stream) = mpsc::channel(EXPORT_QUEUE);
         let store = self.store.clone();
         tokio::spawn(async move {
@@ -207,10 +214,28 @@ impl LearnerService for LearnerGrpc {
 
     async fn get_fit(&self, request: Request<pb::GetFitRequest>) -> Result<Response<pb::GetFitResponse>, Status> {
         let id = from_proto::fit_prefix(&request.into_inner().fit_id).map_err(CallError::from)?;
-        let fit = self
-            .read(move |store| store.fit(&id)?.ok_or(CallError::NotFound { field: "fit_id", what: "fit", id }))
-            .await?;
+        let fit = self.read(move |store| store.fit(&id)?.ok_or_else(|| no_fit(id))).await?;
         Ok(Response::new(pb::GetFitResponse { fit: Some(fit) }))
+    }
+
+    async fn list_fit_trajectories(
+        &self,
+        request: Request<pb::ListFitTrajectoriesRequest>,
+    ) -> Result<Response<pb::ListFitTrajectoriesResponse>, Status> {
+        let pb::ListFitTrajectoriesRequest { fit_id, page_size, page_token } = request.into_inner();
+        let id = from_proto::fit_prefix(&fit_id).map_err(CallError::from)?;
+        let limit = from_proto::page_size(page_size, PAGE_SIZE, MAX_TRAJECTORY_PAGE).map_err(CallError::from)?;
+        let list = pb::ListFitTrajectoriesRequest { fit_id, ..Default::default() };
+        let scope = from_proto::page_scope("fit trajectories", &list);
+        let after = from_proto::page_start(&page_token, scope).map_err(CallError::from)?.unwrap_or(0).max(0) as u64;
+        let (ids, total) = self
+            .read(move |store| store.fit_trajectories(&id, after, limit as usize)?.ok_or_else(|| no_fit(id)))
+            .await?;
+        let read = after + ids.len() as u64;
+        let more = read < total && !ids.is_empty();
+        let next_page_token = if more { from_proto::page_token(read as i64, scope) } else { String::new() };
+        let trajectory_ids = ids.iter().map(ToString::to_string).collect();
+        Ok(Response::new(pb::ListFitTrajectoriesResponse { trajectory_ids, next_page_token, total }))
     }
 
     async fn list_fits(&self, request: Request<pb::ListFitsRequest>) -> Result<Response<pb::ListFitsResponse>, Status> {
@@ -236,6 +261,10 @@ impl LearnerService for LearnerGrpc {
         if self.store.delete_fit(id.clone()).await.map_err(CallError::from)? {
             return Ok(Response::new(pb::DeleteFitResponse {}));
         }
-        Err(CallError::NotFound { field: "fit_id", what: "fit", id }.into())
+        Err(no_fit(id).into())
     }
+}
+
+fn no_fit(id: String) -> CallError {
+    CallError::NotFound { field: "fit_id", what: "fit", id }
 }

@@ -6,14 +6,19 @@
 //! read costs the rows that lie on it and no others.
 
 use super::{
-    Arrays, Collection, Model, Recording, StoreError, filter::stored_uuid, fits, models, schema, trajectories,
+    Arrays, Collection, Model, Recording, StoreError,
+    filter::stored_uuid,
+    fits, models,
+    packing::{torn, unpack},
+    schema,
+    trajectories::{self, blob},
 };
-use bytes::Bytes;
 use rusqlite::Connection;
 use std::{
     collections::HashMap,
     path::{Path, PathBuf},
 };
+use uuid::Uuid;
 
 /// Findings of SQLite's that are told at most.
 const MAX_FINDINGS: u32 = 100;
@@ -159,7 +164,7 @@ pub(super) fn walk(
     let keys = Keys::new(&snapshot, "trajectories", "seq", &["trajectories_by_collection"], whole);
     keys.try_for_each(|key, known| {
         let name = || names.get(&key).cloned().unwrap_or_else(|| format!("row {key}"));
-        match trajectory(&snapshot, path, &mut collections, key) {
+        match trajectory(&snapshot, path, found.schema, &mut collections, key) {
             Ok(Some((recorded_at_us, recording))) => {
                 visit(Sound::Trajectory { seq: key, recorded_at_us, recording: &recording })?;
                 found.count(Kind::Trajectory, Ok(()));
@@ -260,8 +265,9 @@ fn names(connection: &Connection) -> HashMap<i64, String> {
     let Ok(mut statement) = connection.prepare(sql) else { return names };
     let Ok(mut rows) = statement.query([]) else { return names };
     while let Ok(Some(row)) = rows.next() {
-        if let (Ok(seq), Ok(id)) = (row.get(0), row.get(1)) {
-            names.insert(seq, id);
+        let id = row.get_ref(1).ok().and_then(|id| stored_uuid(id).ok());
+        if let (Ok(seq), Some(id)) = (row.get(0), id) {
+            names.insert(seq, id.to_string());
         }
     }
     names
@@ -274,18 +280,23 @@ type Unreadable = (Option<String>, StoreError);
 fn trajectory(
     connection: &Connection,
     path: &Path,
+    schema: i64,
     collections: &mut HashMap<i64, Collection>,
     seq: i64,
 ) -> Result<Option<(i64, Recording)>, Unreadable> {
     let mut id = None;
     let read = (|| {
-        let sql = "SELECT trajectory_id, collection, recorded_at, seed, steps, final_state, terminated, truncated, \
-                   content_hash, states, actions, rewards FROM trajectories WHERE seq = ?";
-        let mut statement = connection.prepare_cached(sql)?;
+        // Schema 1 stored all arrays as wide as this.
+        let packing = if schema < 2 { "0x844" } else { "packing" };
+        let sql = format!(
+            "SELECT trajectory_id, collection, recorded_at, seed, steps, final_state, terminated, truncated, \
+             content_hash, states, actions, rewards, {packing} FROM trajectories WHERE seq = ?"
+        );
+        let mut statement = connection.prepare_cached(&sql)?;
         let mut rows = statement.query([seq])?;
         let Some(row) = rows.next()? else { return Ok(None) };
-        let text = row.get::<_, String>(0)?;
-        id = Some(text.clone());
+        let uuid = stored_uuid(row.get_ref(0)?);
+        id = uuid.as_ref().ok().map(Uuid::to_string);
         let collection_row: i64 = row.get(1)?;
         let collection = if let Some(collection) = collections.get(&collection_row) {
             collection.clone()
@@ -294,22 +305,24 @@ fn trajectory(
             collections.insert(collection_row, collection.clone());
             collection
         };
-        let blob = |column| row.get::<_, Vec<u8>>(column).map(Bytes::from);
-        let arrays = Arrays {
-            final_state: row.get(5)?,
-            terminated: row.get(6)?,
-            truncated: row.get(7)?,
-            states: blob(9)?,
-            actions: blob(10)?,
-            rewards: blob(11)?,
-        };
+        let arrays = unpack(row.get(12)?, [blob(row, 9)?, blob(row, 10)?, blob(row, 11)?]);
+        let (final_state, terminated, truncated) = (row.get(5)?, row.get(6)?, row.get(7)?);
+        let arrays = arrays.map(|[states, actions, rewards]| Arrays {
+            states,
+            actions,
+            rewards,
+            final_state,
+            terminated,
+            truncated,
+        });
         let seed = row.get::<_, Option<i64>>(3)?.map(|bits| bits as u64);
         let (recorded_at_us, steps, hash): (i64, i64, Vec<u8>) = (row.get(2)?, row.get(4)?, row.get(8)?);
-        Ok(Some((text, collection, seed, arrays, recorded_at_us, steps, hash)))
+        Ok(Some((uuid, collection, seed, arrays, recorded_at_us, steps, hash)))
     })();
     let read = read.map_err(|error: rusqlite::Error| (id.clone(), StoreError::from_sqlite(path, &error)))?;
-    let Some((text, collection, seed, arrays, recorded_at_us, steps, hash)) = read else { return Ok(None) };
-    let checked = stored_uuid(&text).and_then(|id| {
+    let Some((uuid, collection, seed, arrays, recorded_at_us, steps, hash)) = read else { return Ok(None) };
+    let checked = uuid.and_then(|id| {
+        let arrays = arrays.ok_or_else(|| torn(format!("trajectory {id}")))?;
         let recording = Recording::new(id, collection, seed, arrays);
         let recording = recording.map_err(|error| damaged("trajectory", error.to_string()))?;
         if recording.content_hash()[..] != hash[..] || i64::from(recording.steps()) != steps {
@@ -319,6 +332,6 @@ fn trajectory(
     });
     match checked {
         Ok(recording) => Ok(Some((recorded_at_us, recording))),
-        Err(error) => Err((Some(text), error)),
+        Err(error) => Err((id, error)),
     }
 }

@@ -124,6 +124,14 @@ impl StoreError {
         }
     }
 
+    /// An error of a file beside the database.
+    pub(super) fn of_file(path: &std::path::Path, error: &io::Error) -> Self {
+        match error.kind() {
+            io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => Self::DiskFull { path: path.to_owned() },
+            _ => Self::Database { path: path.to_owned(), message: error.to_string() },
+        }
+    }
+
     /// An error of the data directory.
     pub(super) fn directory(path: &std::path::Path, error: &io::Error) -> Self {
         Self::Directory { path: path.to_owned(), message: error.to_string(), kind: error.kind() }

@@ -1,13 +1,20 @@
-//! Fits in the database: whole, as a versioned document, beside the columns that lists and searches need.
+//! Fits in the database: whole, as a versioned document, beside the columns that lists and searches need. The ids of the
+//! trajectories that a fit used lie on pages of their own: they are as many as the data, and few ask for them.
 
-use super::StoreError;
+use super::{
+    StoreError,
+    id_list::{IDS_A_PAGE, IdList, Tally, write_page},
+};
 use mazeway_proto::learner as pb;
 use prost::Message as _;
 use rusqlite::{Connection, OptionalExtension, Row, params};
 use std::path::Path;
+use uuid::Uuid;
 
 /// Version of the document: a `mazeway.learner.v1.Fit` behind this byte.
-const DOCUMENT_VERSION: u8 = 1;
+const DOCUMENT_VERSION: u8 = 2;
+/// The version whose documents held the ids of the trajectories too.
+const WITH_IDS: u8 = 1;
 
 /// What is known of a fit without its arrays.
 #[derive(Debug, Clone, PartialEq)]
@@ -36,60 +43,176 @@ pub struct FitInfo {
     pub agreement: f64,
 }
 
-/// Stores a fit whose id and time are set.
-pub(super) fn insert(connection: &Connection, fit: &pb::Fit, created_at_us: i64) -> rusqlite::Result<()> {
+/// A document of the version that held the ids.
+#[derive(Clone, PartialEq, prost::Message)]
+struct OldDocument {
+    #[prost(string, repeated, tag = "10")]
+    trajectory_ids: Vec<String>,
+}
+
+/// Stores a fit whose id and time are set, and the ids of its trajectories, of which it tells number and digest then.
+pub(super) fn insert(
+    connection: &Connection,
+    path: &Path,
+    fit: &mut pb::Fit,
+    ids: &mut IdList,
+    created_at_us: i64,
+) -> Result<(), StoreError> {
+    let fail = |e: rusqlite::Error| StoreError::from_sqlite(path, &e);
+    ids.describe(fit);
+    let row = connection
+        .prepare_cached(
+            "INSERT INTO fits (fit_id, created_at, env_id, style, method, model_id, trajectories, stopped, iterations, \
+             agreement, document) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+        )
+        .and_then(|mut statement| {
+            statement.insert(params![
+                fit.fit_id,
+                created_at_us,
+                fit.env_id,
+                fit.style,
+                fit.request.as_ref().map_or("", |request| request.method.as_str()),
+                fit.model_id,
+                fit.trajectories as i64,
+                fit.stopped,
+                fit.iterations,
+                fit.agreement,
+                document(fit),
+            ])
+        })
+        .map_err(fail)?;
+    ids.write(connection, path, row)
+}
+
+fn document(fit: &pb::Fit) -> Vec<u8> {
     let mut document = vec![DOCUMENT_VERSION];
     document.extend(fit.encode_to_vec());
-    connection.execute(
-        "INSERT INTO fits (fit_id, created_at, env_id, style, method, model_id, trajectories, stopped, iterations, \
-         agreement, document) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
-        params![
-            fit.fit_id,
-            created_at_us,
-            fit.env_id,
-            fit.style,
-            fit.request.as_ref().map_or("", |request| request.method.as_str()),
-            fit.model_id,
-            fit.trajectory_ids.len() as i64,
-            fit.stopped,
-            fit.iterations,
-            fit.agreement,
-            document,
-        ],
-    )?;
-    Ok(())
+    document
+}
+
+/// The row and the whole id of the one fit whose id begins so.
+pub(super) fn find(connection: &Connection, path: &Path, prefix: &str) -> Result<Option<(i64, String)>, StoreError> {
+    let fail = |e: rusqlite::Error| StoreError::from_sqlite(path, &e);
+    let matching = "FROM fits WHERE substr(fit_id, 1, length(?1)) = ?1";
+    let matches: i64 =
+        connection.query_row(&format!("SELECT count(*) {matching}"), [prefix], |row| row.get(0)).map_err(fail)?;
+    if matches > 1 {
+        return Err(StoreError::AmbiguousFit { prefix: prefix.to_owned(), matches: matches as u64 });
+    }
+    let sql = format!("SELECT seq, fit_id {matching}");
+    connection.query_row(&sql, [prefix], |row| Ok((row.get(0)?, row.get(1)?))).optional().map_err(fail)
 }
 
 /// Reads the one fit whose id begins so.
 pub(super) fn get(connection: &Connection, path: &Path, prefix: &str) -> Result<Option<pb::Fit>, StoreError> {
-    let fail = |e: rusqlite::Error| StoreError::from_sqlite(path, &e);
-    let matches: i64 = connection
-        .query_row("SELECT count(*) FROM fits WHERE substr(fit_id, 1, length(?1)) = ?1", [prefix], |row| row.get(0))
-        .map_err(fail)?;
-    if matches > 1 {
-        return Err(StoreError::AmbiguousFit { prefix: prefix.to_owned(), matches: matches as u64 });
-    }
-    let document: Option<Vec<u8>> = connection
-        .query_row("SELECT document FROM fits WHERE substr(fit_id, 1, length(?1)) = ?1", [prefix], |row| row.get(0))
-        .optional()
-        .map_err(fail)?;
-    let Some(document) = document else { return Ok(None) };
-    let corrupt = |message: String| StoreError::Corrupt { what: format!("fit {prefix}"), message };
-    match document.split_first() {
-        Some((&DOCUMENT_VERSION, message)) => pb::Fit::decode(message).map(Some).map_err(|e| corrupt(e.to_string())),
-        version => {
-            Err(corrupt(format!("expected version {DOCUMENT_VERSION}, got {:?}", version.map(|(first, _)| first))))
-        }
+    match find(connection, path, prefix)? {
+        Some((row, id)) => read(connection, path, row, &id).map(Some),
+        None => Ok(None),
     }
 }
 
-/// Reads the fit of a row, and checks that it is what the row says.
+fn read(connection: &Connection, path: &Path, row: i64, id: &str) -> Result<pb::Fit, StoreError> {
+    let document: Vec<u8> = connection
+        .query_row("SELECT document FROM fits WHERE seq = ?", [row], |row| row.get(0))
+        .map_err(|e| StoreError::from_sqlite(path, &e))?;
+    decode(&document).map_err(|message| corrupt(id, message))
+}
+
+/// A document of any version.
+fn decode(document: &[u8]) -> Result<pb::Fit, String> {
+    match document.split_first() {
+        Some((&DOCUMENT_VERSION, message)) => pb::Fit::decode(message).map_err(|e| e.to_string()),
+        Some((&WITH_IDS, message)) => {
+            let mut fit = pb::Fit::decode(message).map_err(|e| e.to_string())?;
+            let mut tally = Tally::default();
+            old_ids(document)?.into_iter().flatten().for_each(|id| tally.add(id.as_bytes()));
+            tally.describe(&mut fit);
+            Ok(fit)
+        }
+        version => Err(format!("expected version {DOCUMENT_VERSION}, got {:?}", version.map(|(first, _)| first))),
+    }
+}
+
+/// The ids that a document holds itself; `None` where they lie beside it.
+fn old_ids(document: &[u8]) -> Result<Option<Vec<Uuid>>, String> {
+    let Some((&WITH_IDS, message)) = document.split_first() else { return Ok(None) };
+    let old = OldDocument::decode(message).map_err(|e| e.to_string())?;
+    let ids = old.trajectory_ids.iter().map(|id| Uuid::parse_str(id).map_err(|e| format!("id {id:?}: {e}")));
+    ids.collect::<Result<_, _>>().map(Some)
+}
+
+fn corrupt(fit_id: &str, message: impl Into<String>) -> StoreError {
+    StoreError::Corrupt { what: format!("fit {fit_id}"), message: message.into() }
+}
+
+/// Takes the ids out of every document that holds them. One that does not read stays as it is: a check will name it.
+pub(super) fn unfold_all(connection: &Connection) -> rusqlite::Result<()> {
+    let mut statement = connection.prepare("SELECT seq FROM fits ORDER BY seq")?;
+    let rows = statement.query_map([], |row| row.get(0))?.collect::<rusqlite::Result<Vec<_>>>()?;
+    rows.into_iter().try_for_each(|row| unfold(connection, row))
+}
+
+/// As [`unfold_all`], of one row.
+pub(super) fn unfold(connection: &Connection, row: i64) -> rusqlite::Result<()> {
+    let old: Vec<u8> = connection.query_row("SELECT document FROM fits WHERE seq = ?", [row], |row| row.get(0))?;
+    let (Ok(fit), Ok(Some(ids))) = (decode(&old), old_ids(&old)) else { return Ok(()) };
+    for (page, ids) in ids.chunks(IDS_A_PAGE).enumerate() {
+        let ids = ids.iter().flat_map(|id| *id.as_bytes()).collect::<Vec<u8>>();
+        write_page(connection, row, page as i64, &ids)?;
+    }
+    connection.execute("UPDATE fits SET document = ? WHERE seq = ?", params![document(&fit), row])?;
+    Ok(())
+}
+
+/// Reads the fit of a row, and checks that it is what the row says and that its trajectories are those that it was made of.
 pub(super) fn by_row(connection: &Connection, path: &Path, seq: i64) -> Result<Option<pb::Fit>, StoreError> {
+    let fail = |e: rusqlite::Error| StoreError::from_sqlite(path, &e);
     let found = connection.query_row("SELECT fit_id FROM fits WHERE seq = ?", [seq], |row| row.get::<_, String>(0));
-    let Some(fit_id) = found.optional().map_err(|e| StoreError::from_sqlite(path, &e))? else { return Ok(None) };
-    let corrupt = |message: &str| StoreError::Corrupt { what: format!("fit {fit_id}"), message: message.into() };
-    let fit = get(connection, path, &fit_id)?.ok_or_else(|| corrupt("it is not found by its id"))?;
-    if fit.fit_id == fit_id { Ok(Some(fit)) } else { Err(corrupt("its document is that of another fit")) }
+    let Some(fit_id) = found.optional().map_err(fail)? else { return Ok(None) };
+    let fit = read(connection, path, seq, &fit_id)?;
+    if fit.fit_id != fit_id {
+        return Err(corrupt(&fit_id, "its document is that of another fit"));
+    }
+    let document: Vec<u8> =
+        connection.query_row("SELECT document FROM fits WHERE seq = ?", [seq], |row| row.get(0)).map_err(fail)?;
+    if document.first() == Some(&DOCUMENT_VERSION) {
+        let mut tally = Tally::default();
+        let sql = "SELECT page, ids FROM fit_trajectories WHERE fit = ? ORDER BY page";
+        let mut statement = connection.prepare_cached(sql).map_err(fail)?;
+        let mut pages = statement.query([seq]).map_err(fail)?;
+        while let Some(page) = pages.next().map_err(fail)? {
+            let ids = page.get_ref(1).and_then(|ids| Ok(ids.as_blob()?)).map_err(fail)?;
+            tally.add(ids);
+        }
+        if tally.n_ids() != fit.trajectories || tally.digest()[..] != fit.trajectories_digest[..] {
+            return Err(corrupt(&fit_id, "the ids of its trajectories are not what was stored: the digests differ"));
+        }
+    }
+    Ok(Some(fit))
+}
+
+/// The ids of a fit's trajectories from the one of rank `after` on, at most `limit`.
+pub(super) fn trajectory_ids(
+    connection: &Connection,
+    path: &Path,
+    row: i64,
+    after: u64,
+    limit: usize,
+) -> Result<Vec<Uuid>, StoreError> {
+    let fail = |e: rusqlite::Error| StoreError::from_sqlite(path, &e);
+    let (page, mut skip) = (after / IDS_A_PAGE as u64, (after % IDS_A_PAGE as u64) as usize);
+    let sql = "SELECT ids FROM fit_trajectories WHERE fit = ? AND page >= ? ORDER BY page";
+    let mut statement = connection.prepare_cached(sql).map_err(fail)?;
+    let mut pages = statement.query(params![row, page.min(i64::MAX as u64) as i64]).map_err(fail)?;
+    let mut ids = Vec::new();
+    while ids.len() < limit
+        && let Some(page) = pages.next().map_err(fail)?
+    {
+        let blob = page.get_ref(0).and_then(|ids| Ok(ids.as_blob()?)).map_err(fail)?;
+        ids.extend(blob.as_chunks().0.iter().skip(skip).take(limit - ids.len()).map(|id| Uuid::from_bytes(*id)));
+        skip = 0;
+    }
+    Ok(ids)
 }
 
 /// Lists fits, newest first, from before `before` on; empty labels mean any.

@@ -14,10 +14,13 @@ mod check;
 mod error;
 mod filter;
 mod fits;
+mod id_list;
 mod models;
 mod options;
+mod packing;
 mod recording;
 mod repair;
+mod scan;
 mod schema;
 mod trajectories;
 mod writer;
@@ -31,6 +34,7 @@ pub use check::{Damage, Kind, Tally, Verification, verify};
 pub use error::StoreError;
 pub use filter::Filter;
 pub use fits::FitInfo;
+pub use id_list::IdList;
 pub use models::{Model, ModelInfo, Put, Rows, check_header};
 pub use options::StoreOptions;
 pub use recording::{
@@ -38,6 +42,7 @@ pub use recording::{
     unpack_f64, unpack_u32,
 };
 pub use repair::{Repair, repair};
+pub use scan::Stored;
 pub use schema::FILE_NAME;
 pub use trajectories::{Cursor, TrajectorySummary};
 pub use writer::Pending;
@@ -52,6 +57,7 @@ use std::{
     time::SystemTime,
 };
 use tokio::sync::Semaphore;
+use uuid::Uuid;
 use writer::Writer;
 
 /// Bytes of arrays that wait for the disk at most; more wait in their callers.
@@ -187,15 +193,21 @@ impl Store {
         self.0.writer.queue(job).await?.committed().await
     }
 
-    /// Stores a fit, whose id is set, and returns it with the time at which it was stored.
-    pub async fn put_fit(&self, mut fit: pb::Fit) -> Result<pb::Fit, StoreError> {
-        self.write(move |connection| {
+    /// A list for the ids of the trajectories that a fit uses.
+    pub fn id_list(&self) -> IdList {
+        IdList::new(self.path().parent().unwrap_or(Path::new(".")))
+    }
+
+    /// Stores a fit, whose id is set, with the ids of its trajectories, and returns it with their number and digest and the
+    /// time at which it was stored.
+    pub async fn put_fit(&self, mut fit: pb::Fit, mut ids: IdList) -> Result<pb::Fit, StoreError> {
+        let job = move |work: &mut writer::Work<'_>| {
             let now = now_us();
             fit.created_at = Some(timestamp(now));
-            fits::insert(connection, &fit, now)?;
+            fits::insert(work.connection, work.path, &mut fit, &mut ids, now)?;
             Ok(fit)
-        })
-        .await
+        };
+        self.0.writer.queue(job).await?.committed().await
     }
 
     /// Deletes a fit by its whole id and says whether there was one.
@@ -246,28 +258,45 @@ impl Store {
         next_page(&*self.reader()?, self.path(), cursor)
     }
 
+    /// As [`Store::cursor`], over what a fit used and the filter selects too; `None` where no fit's id begins so. Blocks.
+    ///
+    /// # Errors
+    /// [`StoreError::AmbiguousFit`] where there are several.
+    pub fn fit_cursor(&self, prefix: &str, filter: &Filter) -> Result<Option<Cursor>, StoreError> {
+        let found = fits::find(&*self.reader()?, self.path(), prefix)?;
+        Ok(found.map(|(row, _)| Cursor::of_fit(row, filter)))
+    }
+
+    /// Ids of the trajectories that a fit used, from the one of rank `after` on, at most `limit`, and how many there are in
+    /// all; `None` where no fit's id begins so. Blocks.
+    ///
+    /// # Errors
+    /// [`StoreError::AmbiguousFit`] where there are several.
+    pub fn fit_trajectories(
+        &self,
+        prefix: &str,
+        after: u64,
+        limit: usize,
+    ) -> Result<Option<(Vec<Uuid>, u64)>, StoreError> {
+        let reader = self.reader()?;
+        let Some((row, _)) = fits::find(&reader, self.path(), prefix)? else { return Ok(None) };
+        let ids = fits::trajectory_ids(&reader, self.path(), row, after, limit)?;
+        let total: i64 = reader
+            .query_row("SELECT trajectories FROM fits WHERE seq = ?", [row], |row| row.get(0))
+            .map_err(|e| StoreError::from_sqlite(self.path(), &e))?;
+        Ok(Some((ids, total as u64)))
+    }
+
     /// Calls `visit` with every trajectory that the filter selects, without its rewards (no method learns from them), all as
     /// they stand at the first. Blocks.
     pub fn for_each<B>(
         &self,
         filter: &Filter,
-        mut visit: impl FnMut(Recording) -> ControlFlow<B>,
+        visit: impl FnMut(&Stored<'_>) -> ControlFlow<B>,
     ) -> Result<ControlFlow<B>, StoreError> {
         let reader = self.reader()?;
-        let fail = |e: rusqlite::Error| StoreError::from_sqlite(self.path(), &e);
-        let snapshot = reader.unchecked_transaction().map_err(fail)?;
-        let mut cursor = Cursor::new(&snapshot, filter).map_err(fail)?.without_rewards();
-        loop {
-            let page = next_page(&snapshot, self.path(), &mut cursor)?;
-            if page.is_empty() {
-                return Ok(ControlFlow::Continue(()));
-            }
-            for recording in page {
-                if let ControlFlow::Break(value) = visit(recording) {
-                    return Ok(ControlFlow::Break(value));
-                }
-            }
-        }
+        let snapshot = reader.unchecked_transaction().map_err(|e| StoreError::from_sqlite(self.path(), &e))?;
+        scan::scan(&snapshot, self.path(), filter, visit)
     }
 
     /// Reads a model. Blocks.

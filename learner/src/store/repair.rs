@@ -7,7 +7,7 @@
 use super::{
     StoreError, StoreOptions, Verification,
     check::{Sound, walk},
-    models, schema, trajectories,
+    fits, models, schema, trajectories,
 };
 use rusqlite::{Connection, params, params_from_iter, types::Value};
 use std::{
@@ -69,12 +69,13 @@ fn take_over(old: &Connection, path: &Path, new: &Connection, new_path: &Path) -
     let fail = |e: rusqlite::Error| StoreError::from_sqlite(new_path, &e);
     let transaction = new.unchecked_transaction().map_err(fail)?;
     let mut collections = trajectories::CollectionCache::new();
+    let has_pages = old.prepare("SELECT 1 FROM fit_trajectories").is_ok();
     let found = walk(old, path, |sound| match sound {
         Sound::Trajectory { seq, recorded_at_us, recording } => {
             if !trajectories::insert(&transaction, new_path, &mut collections, recording, 0)? {
                 return Ok(());
             }
-            let place = params![seq, recorded_at_us, recording.id().to_string()];
+            let place = params![seq, recorded_at_us, recording.id().into_bytes()];
             let sql = "UPDATE trajectories SET seq = ?, recorded_at = ? WHERE trajectory_id = ?";
             transaction.prepare_cached(sql).and_then(|mut s| s.execute(place)).map(drop).map_err(fail)
         }
@@ -83,7 +84,14 @@ fn take_over(old: &Connection, path: &Path, new: &Connection, new_path: &Path) -
             let sql = "UPDATE models SET stored_at = ? WHERE model_id = ?";
             transaction.execute(sql, params![stored_at_us, model.model_id()]).map(drop).map_err(fail)
         }
-        Sound::Fit { row } => copy_rows(old, path, &transaction, new_path, "fits", "seq", row),
+        Sound::Fit { row } => {
+            copy_rows(old, path, &transaction, new_path, "fits", "seq", row)?;
+            // An old document holds the ids itself.
+            if has_pages {
+                copy_rows(old, path, &transaction, new_path, "fit_trajectories", "fit", row)?;
+            }
+            fits::unfold(&transaction, row).map_err(fail)
+        }
     })?;
     transaction.commit().map_err(fail)?;
     Ok(found)

@@ -3,7 +3,7 @@
 //! Invariants: a migration, once released, never changes; a schema newer than this release is refused, not guessed at;
 //! opening and migrating happen under a lock on a file beside the database, so several processes may start at once.
 
-use super::{StoreError, StoreOptions};
+use super::{StoreError, StoreOptions, fits};
 use rusqlite::{Connection, OpenFlags, config::DbConfig};
 use rusqlite_migration::{M, Migrations};
 use std::{
@@ -17,10 +17,13 @@ use std::{
 pub const FILE_NAME: &str = "mazeway.sqlite3";
 /// "MZWY": tells the file from any other SQLite database.
 const APPLICATION_ID: i64 = 0x4d5a_5759;
+/// Bytes of a page of a new database: twice SQLite's own, since a page costs a call to read however large it is, and not more,
+/// since a commit writes whole pages.
+const PAGE_BYTES: u32 = 8192;
 /// How long a connection waits for another process.
 const BUSY_TIMEOUT: Duration = Duration::from_secs(30);
 
-/// What is common to many trajectories lies in `collections`, each stored once. A trajectory's arrays are blobs,
+/// What is common to many trajectories lies in `collections`, each stored once. In schema 1 a trajectory's arrays are blobs,
 /// little-endian without padding: states and actions as 32-bit integers, rewards as IEEE 754 doubles. Seeds are
 /// unsigned and stored by their bits. Times are microseconds since the Unix epoch. Documents are a version byte and a
 /// protocol buffer message.
@@ -86,7 +89,53 @@ CREATE INDEX fits_by_env ON fits (env_id, style, seq);
 PRAGMA application_id = 0x4d5a5759;
 ";
 
-const MIGRATIONS: &[M<'static>] = &[M::up(V1)];
+/// From 2 on an id is its 16 bytes; what a count of steps reads comes first in a row, in the fewest bytes (see `packing`);
+/// and the ids of a fit's trajectories lie on pages beside it, so that a fit is as large as its model and no larger.
+/// What schema 1 stored keeps its width.
+const V2: &str = "
+CREATE TABLE trajectories_2 (
+    seq INTEGER PRIMARY KEY AUTOINCREMENT,
+    trajectory_id BLOB NOT NULL UNIQUE,
+    collection INTEGER NOT NULL REFERENCES collections (id),
+    packing INTEGER NOT NULL,
+    final_state INTEGER,
+    states BLOB NOT NULL,
+    actions BLOB NOT NULL,
+    recorded_at INTEGER NOT NULL,
+    seed INTEGER,
+    steps INTEGER NOT NULL,
+    terminated INTEGER NOT NULL,
+    truncated INTEGER NOT NULL,
+    content_hash BLOB NOT NULL,
+    rewards BLOB NOT NULL
+) STRICT;
+
+INSERT INTO trajectories_2 (seq, trajectory_id, collection, packing, final_state, states, actions, recorded_at, seed,
+    steps, terminated, truncated, content_hash, rewards)
+SELECT seq, unhex(trajectory_id, '-'), collection, 0x844, final_state, states, actions, recorded_at, seed,
+    steps, terminated, truncated, content_hash, rewards
+FROM trajectories ORDER BY seq;
+
+DELETE FROM sqlite_sequence WHERE name = 'trajectories_2';
+INSERT INTO sqlite_sequence (name, seq) SELECT 'trajectories_2', seq FROM sqlite_sequence WHERE name = 'trajectories';
+DROP TABLE trajectories;
+ALTER TABLE trajectories_2 RENAME TO trajectories;
+CREATE INDEX trajectories_by_collection ON trajectories (collection, seq);
+
+CREATE TABLE fit_trajectories (
+    fit INTEGER NOT NULL REFERENCES fits (seq) ON DELETE CASCADE,
+    page INTEGER NOT NULL,
+    ids BLOB NOT NULL,
+    PRIMARY KEY (fit, page)
+) STRICT;
+";
+
+/// Version of the newest schema.
+const NEWEST: i64 = 2;
+
+fn migrations() -> Migrations<'static> {
+    Migrations::new(vec![M::up(V1), M::up_with_hook(V2, |transaction| Ok(fits::unfold_all(transaction)?))])
+}
 
 /// Locked while a store is opened, so that one process at a time makes and migrates it.
 const OPENING_FILE: &str = "mazeway.lock";
@@ -170,6 +219,8 @@ pub fn open_database(path: &Path, options: &StoreOptions) -> Result<Connection, 
     let mut connection = connect(path, flags, options).map_err(sqlite)?;
     connection.busy_timeout(BUSY_TIMEOUT).map_err(sqlite)?;
     check_owner(path, &connection)?;
+    // Heeded where the database is new; an old one keeps its size.
+    connection.pragma_update(None, "page_size", PAGE_BYTES).map_err(sqlite)?;
     // FULL makes a commit in WAL mode wait for the disk; `fullfsync` makes macOS mean it.
     connection.pragma_update(None, "journal_mode", "WAL").map_err(sqlite)?;
     connection.pragma_update(None, "synchronous", "FULL").map_err(sqlite)?;
@@ -178,7 +229,7 @@ pub fn open_database(path: &Path, options: &StoreOptions) -> Result<Connection, 
     if let Some(pages) = options.checkpoint_pages {
         connection.pragma_update(None, "wal_autocheckpoint", pages).map_err(sqlite)?;
     }
-    Migrations::from_slice(MIGRATIONS).to_latest(&mut connection).map_err(|error| match error {
+    migrations().to_latest(&mut connection).map_err(|error| match error {
         rusqlite_migration::Error::RusqliteError { err, .. } => StoreError::from_sqlite(path, &err),
         other => StoreError::Database { path: path.to_owned(), message: other.to_string() },
     })?;
@@ -231,7 +282,7 @@ fn check_owner(path: &Path, connection: &Connection) -> Result<(), StoreError> {
     if application_id != APPLICATION_ID && (tables > 0 || application_id != 0) {
         return Err(StoreError::Foreign { path: path.to_owned(), found: application_id });
     }
-    let supported = MIGRATIONS.len() as i64;
+    let supported = NEWEST;
     if found > supported {
         return Err(StoreError::NewerSchema { path: path.to_owned(), found, supported });
     }
@@ -263,7 +314,7 @@ mod tests {
 
     #[test]
     fn migrations_are_sound() {
-        Migrations::from_slice(MIGRATIONS).validate().unwrap();
+        migrations().validate().unwrap();
     }
 
     #[test]
@@ -273,7 +324,7 @@ mod tests {
         connection.pragma_update(None, "user_version", 99).unwrap();
         drop(connection);
         let error = open(directory.path()).unwrap_err();
-        assert!(matches!(error, StoreError::NewerSchema { found: 99, supported: 1, .. }), "{error}");
+        assert!(matches!(error, StoreError::NewerSchema { found: 99, supported: NEWEST, .. }), "{error}");
         let connection = Connection::open(path).unwrap();
         let version: i64 = connection.pragma_query_value(None, "user_version", |row| row.get(0)).unwrap();
         assert_eq!(version, 99);

@@ -273,3 +273,124 @@ fn two_stores_on_one_directory_write_and_read_together() {
         assert_eq!(store.count(&Filter::default()).unwrap(), 150);
     }
 }
+
+/// A fit of this many trajectories, and their ids.
+fn fitted(store: &Store, ids: impl Iterator<Item = u128>) -> (pb::Fit, IdList) {
+    let fit = pb::Fit { fit_id: Uuid::new_v4().to_string(), env_id: "e".into(), ..pb::Fit::default() };
+    let mut list = store.id_list();
+    ids.for_each(|id| list.push(Uuid::from_u128(id)).unwrap());
+    (fit, list)
+}
+
+#[test]
+fn a_fit_tells_what_it_was_made_of_page_by_page() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = Store::open(directory.path()).unwrap();
+    let runtime = runtime();
+    let recordings = (0..1300_u32).map(|i| simple(u128::from(i) + 1, &[i % 100, 3])).collect::<Vec<_>>();
+    runtime.block_on(store.record(recordings.clone())).unwrap();
+    // Every second one, so that a page of ids is two of rows; and a fit of nothing beside it.
+    let chosen = (1..=1300_u128).step_by(2);
+    let mut stored = Vec::new();
+    for ids in [chosen.clone().collect::<Vec<_>>(), Vec::new()] {
+        let (fit, list) = fitted(&store, ids.iter().copied());
+        let fit = runtime.block_on(store.put_fit(fit, list)).unwrap();
+        assert_eq!((fit.trajectories, store.fit(&fit.fit_id).unwrap()), (ids.len() as u64, Some(fit.clone())));
+        stored.push(fit.fit_id);
+    }
+    let all = store.fit_trajectories(&stored[0][..8], 0, 10_000).unwrap().unwrap();
+    assert_eq!(all, (chosen.clone().map(Uuid::from_u128).collect(), 650));
+    for (after, limit) in [(0, 3), (510, 5), (512, 1), (600, 100), (650, 4), (u64::MAX, 4)] {
+        let (ids, total) = store.fit_trajectories(&stored[0], after, limit).unwrap().unwrap();
+        let expected = all.0.iter().skip(after.min(650) as usize).take(limit).copied().collect::<Vec<_>>();
+        assert_eq!((ids, total), (expected, 650));
+    }
+    assert_eq!(store.fit_trajectories(&stored[1], 0, 10).unwrap(), Some((Vec::new(), 0)));
+    assert_eq!(store.fit_trajectories("none", 0, 10).unwrap(), None);
+
+    // Of what is left of them, those that a filter selects too.
+    runtime.block_on(store.delete_trajectories(Filter { ids: vec![Uuid::from_u128(5)], ..Filter::default() })).unwrap();
+    let read = |prefix: &str, filter: &Filter| {
+        let (mut cursor, mut all) = (store.fit_cursor(prefix, filter).unwrap().unwrap(), Vec::new());
+        while let page @ [_, ..] = store.next_page(&mut cursor).unwrap().as_slice() {
+            all.extend(page.iter().cloned());
+        }
+        all
+    };
+    let left = recordings.iter().step_by(2).filter(|r| r.id() != Uuid::from_u128(5)).cloned().collect::<Vec<_>>();
+    assert_eq!(read(&stored[0], &Filter::default()), left);
+    assert_eq!(read(&stored[0], &Filter { style: "other".into(), ..Filter::default() }), []);
+    assert_eq!(read(&stored[1], &Filter::default()), []);
+    assert!(store.fit_cursor("none", &Filter::default()).unwrap().is_none());
+
+    // The ids go with the fit, and wrong ones are found.
+    assert!(runtime.block_on(store.delete_fit(stored.remove(1))).unwrap());
+    let found = verify(directory.path()).unwrap();
+    assert!(found.is_sound() && found.fits.sound == 1, "{found:?}");
+    let spoil = |sql: &'static str| {
+        runtime.block_on(store.write(move |connection: &Connection| connection.execute(sql, []))).unwrap();
+        let found = verify(directory.path()).unwrap();
+        (found.fits.damaged, found.damage.first().map(|damage| damage.message.clone()).unwrap_or_default())
+    };
+    let (damaged, message) = spoil("UPDATE fit_trajectories SET ids = CAST(ids || 'x' AS BLOB) WHERE page = 1");
+    assert!(damaged == 1 && message.contains("the digests differ"), "{message}");
+    assert_eq!(spoil("DELETE FROM fit_trajectories").0, 1);
+}
+
+#[test]
+fn fits_of_long_lists_are_read_a_page_at_a_time() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = Store::open(directory.path()).unwrap();
+    let runtime = runtime();
+    // A page of two such trajectories is more than a reader holds at a time.
+    let recordings = (1..=5).map(|id| simple(id, &vec![1; 100_000])).collect::<Vec<_>>();
+    runtime.block_on(store.record(recordings.clone())).unwrap();
+    let (fit, list) = fitted(&store, (1..=4).chain([99]));
+    let fit = runtime.block_on(store.put_fit(fit, list)).unwrap();
+    let mut cursor = store.fit_cursor(&fit.fit_id, &Filter::default()).unwrap().unwrap();
+    for recording in &recordings[..4] {
+        assert_eq!(store.next_page(&mut cursor).unwrap(), std::slice::from_ref(recording));
+    }
+    assert!(store.next_page(&mut cursor).unwrap().is_empty() && cursor.is_done());
+}
+
+#[test]
+fn a_count_sees_every_trajectory_once_and_in_order_whatever_is_asked() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = Store::open(directory.path()).unwrap();
+    let runtime = runtime();
+    // One style in three holds a tenth, and is read along its index.
+    let recordings = (0..300_u32).map(|i| {
+        let (id, mut collection, _, arrays) = simple(u128::from(i) + 1, &[i % 100; 5]).into_parts();
+        collection.style = if i % 10 == 0 {
+            "seldom"
+        } else if i % 2 == 0 {
+            "often"
+        } else {
+            "s"
+        }
+        .into();
+        collection.n_states = if i % 3 == 0 { 100 } else { 70_000 };
+        Recording::new(id, collection, None, arrays).unwrap()
+    });
+    let recordings = recordings.collect::<Vec<_>>();
+    runtime.block_on(store.record(recordings.clone())).unwrap();
+    for filter in [
+        Filter::default(),
+        Filter { style: "seldom".into(), ..Filter::default() },
+        Filter { style: "often".into(), ..Filter::default() },
+        Filter { ids: (5..90).rev().map(Uuid::from_u128).collect(), ..Filter::default() },
+        Filter { ids: vec![Uuid::from_u128(11)], style: "often".into(), ..Filter::default() },
+    ] {
+        let mut seen = Vec::new();
+        let outcome = store.for_each(&filter, |stored| {
+            seen.push(stored.recording());
+            assert_eq!(stored.states().to_vec(), unpack_u32(&seen[seen.len() - 1].arrays().states).collect::<Vec<_>>());
+            ControlFlow::<()>::Continue(())
+        });
+        assert_eq!(outcome.unwrap(), ControlFlow::Continue(()));
+        assert_eq!(seen, recordings.iter().filter(|r| passes(&filter, r)).cloned().collect::<Vec<_>>(), "{filter:?}");
+        let first = store.for_each(&filter, |stored| ControlFlow::Break(stored.id())).unwrap();
+        assert_eq!(first, seen.first().map_or(ControlFlow::Continue(()), |first| ControlFlow::Break(first.id())));
+    }
+}

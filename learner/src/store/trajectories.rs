@@ -3,16 +3,16 @@
 use super::{
     Arrays, Collection, Filter, Recording, StoreError,
     filter::{Condition, stored_uuid},
-    now_us,
+    fits, now_us,
+    packing::{pack, torn, unpack},
 };
-use bytes::Bytes;
 use rusqlite::{Connection, OptionalExtension, Row, params, params_from_iter, types::Value};
-use std::{collections::HashMap, path::Path};
+use std::{collections::HashMap, path::Path, sync::Arc};
 use uuid::Uuid;
 
-/// What [`Cursor::page`] reads of a row, the rewards last.
-const COLUMNS: &str =
-    "seq, trajectory_id, collection, seed, final_state, terminated, truncated, content_hash, states, actions";
+/// What [`Cursor::page`] reads of a row.
+const COLUMNS: &str = "seq, trajectory_id, collection, seed, final_state, terminated, truncated, content_hash, packing, states, \
+                       actions, rewards";
 /// Rows that a page of whole trajectories holds at most.
 const PAGE_ROWS: usize = 512;
 
@@ -46,7 +46,7 @@ pub(super) fn insert(
 ) -> Result<bool, StoreError> {
     let fail = |e: rusqlite::Error| StoreError::from_sqlite(path, &e);
     let hash = recording.content_hash();
-    let id = recording.id().to_string();
+    let id = recording.id().into_bytes();
     let collection = if let Some(&id) = cache.get(recording.collection()) {
         id
     } else {
@@ -55,10 +55,11 @@ pub(super) fn insert(
         id
     };
     let arrays = recording.arrays();
+    let packed = pack(arrays, recording.collection().n_states, recording.collection().n_actions);
     let inserted = connection
         .prepare_cached(
             "INSERT INTO trajectories (trajectory_id, collection, recorded_at, seed, steps, final_state, terminated, \
-             truncated, content_hash, states, actions, rewards) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?) \
+             truncated, content_hash, packing, states, actions, rewards) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?) \
              ON CONFLICT (trajectory_id) DO NOTHING",
         )
         .and_then(|mut statement| {
@@ -72,9 +73,10 @@ pub(super) fn insert(
                 arrays.terminated,
                 arrays.truncated,
                 hash,
-                arrays.states.as_ref(),
-                arrays.actions.as_ref(),
-                arrays.rewards.as_ref(),
+                packed.packing.code(),
+                packed.states.as_ref(),
+                packed.actions.as_ref(),
+                packed.rewards.as_ref(),
             ])
         })
         .map_err(fail)?;
@@ -83,7 +85,7 @@ pub(super) fn insert(
     }
     let stored: Vec<u8> = connection
         .prepare_cached("SELECT content_hash FROM trajectories WHERE trajectory_id = ?")
-        .and_then(|mut statement| statement.query_row([&id], |row| row.get(0)))
+        .and_then(|mut statement| statement.query_row([id], |row| row.get(0)))
         .map_err(fail)?;
     if stored == hash { Ok(false) } else { Err(StoreError::TrajectoryExists { id: recording.id(), index }) }
 }
@@ -147,8 +149,8 @@ pub(super) fn summaries(
     while let Some(row) = rows.next().map_err(fail)? {
         summaries.push(TrajectorySummary {
             seq: row.get(0).map_err(fail)?,
-            id: stored_uuid(&row.get::<_, String>(1).map_err(fail)?)?,
-            collection: collections.get(connection, row.get(2).map_err(fail)?).map_err(fail)?,
+            id: stored_uuid(row.get_ref(1).map_err(fail)?)?,
+            collection: Collection::clone(&*collections.get(connection, row.get(2).map_err(fail)?).map_err(fail)?),
             seed: row.get::<_, Option<i64>>(3).map_err(fail)?.map(|bits| bits as u64),
             steps: row.get(4).map_err(fail)?,
             recorded_at_us: row.get(5).map_err(fail)?,
@@ -163,10 +165,6 @@ pub(super) fn summaries(
 pub struct Cursor {
     place: Place,
     collections: Collections,
-    /// What is read in the place of the rewards.
-    rewards: &'static str,
-    /// Whether all is read that the hash is of.
-    whole: bool,
 }
 
 #[derive(Debug)]
@@ -175,6 +173,9 @@ enum Place {
     Scan { filter: Box<Filter>, after: i64, last: i64 },
     /// The rows of a list of ids, which a filter may narrow: those left, the next one last.
     Rows(Vec<i64>),
+    /// What the fit of a row used, which a filter may narrow: the ids from rank `next` on, of which those of a page may be
+    /// read up to the row `after`.
+    Fit { filter: Box<Filter>, fit: i64, next: u64, after: i64 },
 }
 
 impl Cursor {
@@ -189,15 +190,16 @@ impl Cursor {
             let rows = statement.query_map(params_from_iter(condition.values()), |row| row.get(0))?;
             Place::Rows(rows.collect::<rusqlite::Result<_>>()?)
         };
-        Ok(Self { place, collections: Collections::default(), rewards: "rewards", whole: true })
+        Ok(Self { place, collections: Collections::default() })
     }
 
-    /// Leaves the rewards on the disk, where they are half of what there is to read: trajectories come without.
-    pub(super) fn without_rewards(self) -> Self {
-        Self { rewards: "x''", whole: false, ..self }
+    /// What the fit of a row used, where the filter selects it too.
+    pub(super) fn of_fit(fit: i64, filter: &Filter) -> Self {
+        let place = Place::Fit { filter: Box::new(filter.clone()), fit, next: 0, after: i64::MIN };
+        Self { place, collections: Collections::default() }
     }
 
-    /// The next trajectories: at least one unless there are no more, then so many as fit into `max_bytes`.
+    /// The next trajectories, so many as fit into `max_bytes` and at least one; none where all that was asked for is gone.
     pub(super) fn page(
         &mut self,
         connection: &Connection,
@@ -205,23 +207,31 @@ impl Cursor {
         max_bytes: usize,
     ) -> Result<Vec<Recording>, StoreError> {
         let fail = |e: rusqlite::Error| StoreError::from_sqlite(path, &e);
-        let rewards = self.rewards;
         let (sql, values): (String, Vec<Value>) = match &self.place {
             Place::Scan { filter, after, last } => {
                 let mut condition = Condition::new(connection, filter).map_err(fail)?;
                 condition.and("seq > ? AND seq <= ?", [Value::from(*after), Value::from(*last)]);
                 let sql = format!(
-                    "SELECT {COLUMNS}, {rewards} FROM trajectories WHERE {} ORDER BY seq LIMIT {PAGE_ROWS}",
+                    "SELECT {COLUMNS} FROM trajectories WHERE {} ORDER BY seq LIMIT {PAGE_ROWS}",
                     condition.sql()
                 );
                 (sql, condition.into_values())
             }
             Place::Rows(left) => {
                 let next = left.iter().rev().take(PAGE_ROWS).map(i64::to_string).collect::<Vec<_>>().join(", ");
-                (
-                    format!("SELECT {COLUMNS}, {rewards} FROM trajectories WHERE seq IN ({next}) ORDER BY seq"),
-                    Vec::new(),
-                )
+                (format!("SELECT {COLUMNS} FROM trajectories WHERE seq IN ({next}) ORDER BY seq"), Vec::new())
+            }
+            Place::Fit { filter, fit, next, after, .. } => {
+                let ids = fits::trajectory_ids(connection, path, *fit, *next, PAGE_ROWS)?;
+                if ids.is_empty() {
+                    self.place = Place::Rows(Vec::new());
+                    return Ok(Vec::new());
+                }
+                let mut condition = Condition::along_table(connection, filter).map_err(fail)?;
+                condition.and("seq > ?", [Value::from(*after)]);
+                condition.and_ids(&ids);
+                let sql = format!("SELECT {COLUMNS} FROM trajectories WHERE {} ORDER BY seq", condition.sql());
+                (sql, condition.into_values())
             }
         };
         let mut statement = connection.prepare(&sql).map_err(fail)?;
@@ -251,6 +261,13 @@ impl Cursor {
                 let end = if full { reached } else { left.get(left.len() - asked).copied() };
                 left.retain(|seq| Some(*seq) > end);
             }
+            Place::Fit { next, after, .. } => {
+                if full {
+                    *after = reached.unwrap_or(*after);
+                } else {
+                    (*next, *after) = (*next + PAGE_ROWS as u64, i64::MIN);
+                }
+            }
         }
     }
 
@@ -259,27 +276,32 @@ impl Cursor {
         match &self.place {
             Place::Scan { after, last, .. } => after >= last,
             Place::Rows(left) => left.is_empty(),
+            // Whether there are more ids is seen by asking for them.
+            Place::Fit { .. } => false,
         }
     }
 
     fn read(&mut self, connection: &Connection, row: &Row<'_>) -> rusqlite::Result<Result<Recording, StoreError>> {
-        let id = match stored_uuid(row.get_ref(1)?.as_str()?) {
+        let id = match stored_uuid(row.get_ref(1)?) {
             Ok(id) => id,
             Err(error) => return Ok(Err(error)),
         };
         let collection = self.collections.get(connection, row.get(2)?)?;
         let seed = row.get::<_, Option<i64>>(3)?.map(|bits| bits as u64);
-        let blob = |column| row.get_ref(column)?.as_blob().map(Bytes::copy_from_slice).map_err(rusqlite::Error::from);
+        let Some([states, actions, rewards]) = unpack(row.get(8)?, [blob(row, 9)?, blob(row, 10)?, blob(row, 11)?])
+        else {
+            return Ok(Err(torn(format!("trajectory {id}"))));
+        };
         let arrays = Arrays {
             final_state: row.get(4)?,
             terminated: row.get(5)?,
             truncated: row.get(6)?,
-            states: blob(8)?,
-            actions: blob(9)?,
-            rewards: blob(10)?,
+            states,
+            actions,
+            rewards,
         };
-        let recording = Recording::from_stored(id, collection, seed, arrays);
-        if self.whole && row.get_ref(7)?.as_blob()? != recording.content_hash() {
+        let recording = Recording::from_stored(id, Collection::clone(&collection), seed, arrays);
+        if row.get_ref(7)?.as_blob()? != recording.content_hash() {
             let message = "its content is not what was stored: the hashes differ".into();
             return Ok(Err(StoreError::Corrupt { what: format!("trajectory {id}"), message }));
         }
@@ -287,17 +309,22 @@ impl Cursor {
     }
 }
 
+/// An array as it is stored.
+pub(super) fn blob<'a>(row: &'a Row<'_>, column: usize) -> rusqlite::Result<&'a [u8]> {
+    Ok(row.get_ref(column)?.as_blob()?)
+}
+
 /// Collections by row id, read once each.
 #[derive(Debug, Default)]
-struct Collections(HashMap<i64, Collection>);
+pub(super) struct Collections(HashMap<i64, Arc<Collection>>);
 
 impl Collections {
-    fn get(&mut self, connection: &Connection, id: i64) -> rusqlite::Result<Collection> {
+    pub(super) fn get(&mut self, connection: &Connection, id: i64) -> rusqlite::Result<Arc<Collection>> {
         if let Some(collection) = self.0.get(&id) {
-            return Ok(collection.clone());
+            return Ok(Arc::clone(collection));
         }
-        let collection = collection(connection, id)?;
-        self.0.insert(id, collection.clone());
+        let collection = Arc::new(collection(connection, id)?);
+        self.0.insert(id, Arc::clone(&collection));
         Ok(collection)
     }
 }

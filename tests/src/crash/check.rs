@@ -246,7 +246,11 @@ pub(super) fn read(store: &Store) -> Result<Contents, TestCaseError> {
     }
     for info in expect(store.fits("", "", i64::MAX, u32::MAX))? {
         let fit = expect(store.fit(&info.fit_id))?.ok_or_else(|| TestCaseError::fail("a fit that is listed"))?;
-        contents.fits.insert(info.fit_id, pb::Fit { created_at: None, ..fit });
+        let (ids, total) = expect(store.fit_trajectories(&info.fit_id, 0, usize::MAX))?
+            .ok_or_else(|| TestCaseError::fail("the trajectories of a fit that is listed"))?;
+        prop_assert_eq!((fit.trajectories, total), (ids.len() as u64, ids.len() as u64));
+        let plain = pb::Fit { created_at: None, trajectories: 0, trajectories_digest: Default::default(), ..fit };
+        contents.fits.insert(info.fit_id, (plain, ids));
     }
     Ok(contents)
 }

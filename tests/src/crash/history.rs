@@ -163,6 +163,12 @@ pub fn fit(number: u8) -> pb::Fit {
     }
 }
 
+/// Ids of the trajectories of a fit, by its number: none, a few, or more than a page of them.
+pub fn fit_ids(number: u8) -> Vec<Uuid> {
+    let n = [0, 7, 1100][usize::from(number % OTHERS)];
+    (0..n).map(|i| Uuid::from_u128(u128::from(number % OTHERS) << 64 | i)).collect()
+}
+
 /// What a store holds.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Contents {
@@ -170,8 +176,8 @@ pub struct Contents {
     pub recordings: Vec<Recording>,
     /// Models by id.
     pub models: BTreeMap<String, Model>,
-    /// Fits by id, without their times.
-    pub fits: BTreeMap<String, pb::Fit>,
+    /// Fits by id, without their times and what the store says of their trajectories, and the ids of these.
+    pub fits: BTreeMap<String, (pb::Fit, Vec<Uuid>)>,
 }
 
 impl Contents {

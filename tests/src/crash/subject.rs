@@ -2,7 +2,7 @@
 
 use super::{
     check::{Bench, Tally, check_disk, describe, expect, read, recordings},
-    history::{Contents, Selection, Spec, Step, fit, model},
+    history::{Contents, Selection, Spec, Step, fit, fit_ids, model},
     vfs::with_disk,
 };
 use mazeway_learner::store::{Filter, Put, Recording, Store, StoreError};
@@ -83,10 +83,15 @@ impl<'a> Subject<'a> {
             Step::PutFit(number) => {
                 let fit = fit(*number);
                 let mut after = Contents::clone(&self.visible);
-                if after.fits.insert(fit.fit_id.clone(), fit.clone()).is_some() {
+                let ids = fit_ids(*number);
+                if after.fits.insert(fit.fit_id.clone(), (fit.clone(), ids.clone())).is_some() {
                     same(self)
                 } else {
-                    let put = self.bench.runtime.block_on(self.store().put_fit(fit));
+                    let mut list = self.store().id_list();
+                    for id in ids {
+                        expect(list.push(id))?;
+                    }
+                    let put = self.bench.runtime.block_on(self.store().put_fit(fit, list));
                     self.outcome(put, |_| true, after)?
                 }
             }

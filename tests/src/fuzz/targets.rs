@@ -399,6 +399,11 @@ fn read_store(directory: &Path) -> Result<(), store::StoreError> {
     }
     for fit in store.fits("", "", i64::MAX, 100)? {
         store.fit(&fit.fit_id)?;
+        store.fit_trajectories(&fit.fit_id, 0, 1000)?;
     }
+    let _ = store.for_each(&filter, |stored| {
+        stored.recording();
+        ControlFlow::<()>::Continue(())
+    })?;
     Ok(())
 }

@@ -97,7 +97,12 @@ class Fit:
         #: What was asked, defaults filled in.
         self.options: dict[str, Any] = _options_from_wire(message.request.options)
         self.n_states, self.n_actions = pairs
-        self.trajectory_ids: list[str] = list(message.trajectory_ids)
+        #: Number of demonstrations used; `Learner.fit_trajectories` gives their ids.
+        self.trajectories: int = message.trajectories
+        #: SHA-256 over their ids in the order used: the same for two fits of the same data.
+        self.trajectories_digest: bytes = message.trajectories_digest
+        #: How many of them came from each source.
+        self.sources: dict[str, int] = {s.source: s.trajectories for s in message.sources}
         #: Demonstrated steps used in all.
         self.steps: int = message.steps
         #: Weights of the basis functions, shape (n_basis,).
@@ -177,7 +182,7 @@ class Fit:
             ("environment", self.env_id),
             ("style", self.style or "(several)"),
             ("method", self.method),
-            ("demonstrations", f"{len(self.trajectory_ids)} ({self.steps} steps)"),
+            ("demonstrations", f"{self.trajectories} ({self.steps} steps)"),
             ("states covered", f"{self.states_covered} of {self.n_states}"),
             ("agreement", f"{self.agreement:.3f}"),
             ("log-likelihood a step", f"{self.log_likelihood_per_step:.4f}"),

@@ -148,22 +148,35 @@ class Learner:
             for fit in page.fits
         ]
 
+    def fit_trajectories(self, fit_id: str) -> Iterator[str]:
+        """Ids of the demonstrations that a fit used, in the order used, a page at a time.
+
+        Args:
+            fit_id: The fit's id, or the first eight or more characters of it.
+        """
+        request = _wire.learner.ListFitTrajectoriesRequest(fit_id=fit_id, page_size=10_000)
+        for page in self._pages("ListFitTrajectories", request):
+            yield from page.trajectory_ids
+
     def delete_fit(self, fit_id: str) -> None:
         """Deletes a stored fit by its whole id."""
         request = _wire.learner.DeleteFitRequest(fit_id=fit_id)
         self._transport.unary("DeleteFit", request, timeout=self.timeout)
 
-    def trajectories(self, env_id: str = "", style: str = "", **conditions: Any) -> list[Trajectory]:
+    def trajectories(
+        self, env_id: str = "", style: str = "", *, fit_id: str = "", **conditions: Any
+    ) -> list[Trajectory]:
         """Stored demonstrations with their arrays, in the order in which they were recorded.
 
         Args:
             env_id: Of this environment; empty is any.
             style: Of this style; empty is any.
+            fit_id: Those alone that this fit used; empty is any.
             **conditions: model_id, source, trajectory_ids, min_seed, max_seed, min_steps,
                 recorded_from, recorded_until (datetimes with a time zone).
         """
         request = _wire.learner.ExportTrajectoriesRequest(
-            filter=_filter(env_id=env_id, style=style, **conditions)
+            filter=_filter(env_id=env_id, style=style, **conditions), fit_id=fit_id
         )
         return [
             Trajectory.from_wire(trajectory)

@@ -4,14 +4,15 @@
 //! itself (a method that works in parallel does so on that one), so that times can be compared and no core waits for another.
 
 use super::job::{Entry, Job};
-use crate::cli::scene::Scene;
+use crate::cli::fit::assemble::Truth;
+use mazeway_client::Model;
 use mazeway_learner::{
     eval::{
         self,
         comparison::{Cell, Outcome, Score},
     },
     irl::{self, FitError, FitOptions, Problem},
-    mdp::{Policy, TabularMdp},
+    mdp::{Features, Policy, TabularMdp},
     statistics::Statistics,
     trajectory::{Demonstrations, Trajectory},
 };
@@ -40,9 +41,22 @@ pub struct Seed {
     pub held_out: Vec<Trajectory>,
 }
 
+/// The process that everything happens in.
+pub struct Ground {
+    /// As served or stored.
+    pub model: Model,
+    /// The same, checked.
+    pub mdp: TabularMdp,
+    /// True reward, where it is known.
+    pub truth: Option<Truth>,
+    /// Users' features, where it has some.
+    pub features: Option<Features>,
+}
+
 /// All that fits are made from.
 pub struct Grid {
     mdp: TabularMdp,
+    features: Option<Features>,
     truth: Option<(Vec<f64>, Policy)>,
     seeds: Vec<Seed>,
     entries: Vec<Entry>,
@@ -62,19 +76,19 @@ pub struct Task {
 }
 
 impl Grid {
-    /// Puts together what came from the server.
-    pub fn new(job: &Job, scene: Scene, seeds: Vec<Seed>) -> Self {
-        let n_actions = scene.mdp.n_actions();
-        let truth = scene.truth.and_then(|truth| {
+    /// Puts together what came from the services.
+    pub fn new(job: &Job, ground: Ground, seeds: Vec<Seed>) -> Self {
+        let n_actions = ground.mdp.n_actions();
+        let truth = ground.truth.and_then(|truth| {
             // It came from a planner: it is a policy.
             Policy::new(n_actions, truth.optimal_policy).ok().map(|policy| (truth.reward, policy))
         });
         let mut hash = Sha256::new();
         hash.update(SCHEMA.to_le_bytes());
         hash.update(program());
-        hash.update(&scene.model.model_id);
+        hash.update(&ground.model.model_id);
         hash.update(job.horizon.to_le_bytes());
-        for p in &scene.model.initial_distribution {
+        for p in &ground.model.initial_distribution {
             hash.update(p.to_bits().to_le_bytes());
         }
         if let Some((reward, _)) = &truth {
@@ -82,8 +96,18 @@ impl Grid {
                 hash.update(r.to_bits().to_le_bytes());
             }
         }
+        if let Some(table) = &ground.model.features {
+            for name in &table.names {
+                hash.update((name.len() as u64).to_le_bytes());
+                hash.update(name);
+            }
+            for value in &table.values {
+                hash.update(value.to_bits().to_le_bytes());
+            }
+        }
         Self {
-            mdp: scene.mdp,
+            mdp: ground.mdp,
+            features: ground.features,
             truth,
             seeds,
             entries: job.entries.clone(),
@@ -192,7 +216,7 @@ impl Grid {
             options: &options,
             statistics: &statistics,
             demonstrations: Some(&demonstrations),
-            features: None,
+            features: self.features.as_ref(),
         };
         let mut progress = |_: &irl::TraceEntry| {
             if cancelled.load(Ordering::Relaxed) { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }

@@ -81,6 +81,8 @@ pub struct Job {
     pub seeds: u32,
     /// Steps of each demonstration.
     pub horizon: u32,
+    /// Whether these were asked for.
+    pub horizon_asked: bool,
     /// Held-out episodes of each seed.
     pub rollouts: u32,
     /// Fits at a time.
@@ -116,14 +118,7 @@ impl Job {
         trajectories.dedup();
         let most = trajectories.last().copied().unwrap_or(1);
         let steps = (u64::from(most) + u64::from(args.rollouts)) * u64::from(horizon) * u64::from(args.seeds);
-        if steps > MOST_STEPS {
-            return Err(CliError::usage(
-                format!(
-                    "expected at most {MOST_STEPS} steps in all, got {steps}: demonstrations times steps times seeds"
-                ),
-                "compare with fewer --trajectories, --seeds or a shorter --horizon",
-            ));
-        }
+        check_steps(steps)?;
         Ok(Self {
             env_id: args.env.clone(),
             env_options: env_options(&args.env_options, args.layout.as_deref())?,
@@ -133,12 +128,29 @@ impl Job {
             trajectories,
             seeds: args.seeds,
             horizon,
+            horizon_asked: args.horizon.is_some(),
             rollouts: args.rollouts,
             threads: args.threads.map_or_else(
                 || std::thread::available_parallelism().map_or(1, std::num::NonZeroUsize::get),
                 usize::from,
             ),
         })
+    }
+
+    /// Takes the length of the demonstrations for the horizon, unless one was asked for.
+    pub fn set_horizon(&mut self, longest: u32) {
+        if !self.horizon_asked {
+            self.horizon = longest;
+            self.entries.iter_mut().for_each(|entry| entry.options.horizon = Some(longest));
+        }
+    }
+
+    /// Whether recordings of so many steps can be compared on.
+    ///
+    /// # Errors
+    /// They are too many: each seed holds those that it draws.
+    pub fn check_steps(&self, steps: u64) -> Result<(), CliError> {
+        check_steps(steps.saturating_mul(u64::from(self.seeds)))
     }
 
     /// Discount of all fits and of the expert.
@@ -150,6 +162,16 @@ impl Job {
     pub fn cells(&self) -> usize {
         self.entries.len() * self.trajectories.len() * self.seeds as usize
     }
+}
+
+fn check_steps(steps: u64) -> Result<(), CliError> {
+    if steps <= MOST_STEPS {
+        return Ok(());
+    }
+    Err(CliError::usage(
+        format!("expected at most {MOST_STEPS} steps in all, got {steps}: demonstrations times steps times seeds"),
+        "compare with fewer --trajectories, --seeds or a shorter --horizon",
+    ))
 }
 
 /// Options of an environment as typed, with the layout of a file among them.

@@ -1,13 +1,15 @@
 //! `learner compare`: methods on the same demonstrations, over numbers of demonstrations and seeds.
 //!
-//! Model and demonstrations come from a real environment server through the real client; the fits run in this process. Every
-//! finished fit is in a journal, from which the same command goes on.
+//! Model and demonstrations come from a real environment server through the real client, or, for an environment that only the
+//! learner knows, from its store; the fits run in this process. Every finished fit is in a journal, from which the same command
+//! goes on.
 
 mod args;
 pub mod grid;
 pub mod job;
 mod journal;
 pub mod output;
+mod recorded;
 
 pub use args::CompareArgs;
 
@@ -17,13 +19,13 @@ use super::{
     fit::narrate::Narrator,
     scene::{Environments, Scene},
 };
-use grid::{Grid, Seed};
+use grid::{Grid, Ground, Seed};
 use job::Job;
 use journal::Journal;
 use mazeway_client::Connection;
 use mazeway_learner::eval::comparison::{Cell, Comparison};
 use std::{
-    path::PathBuf,
+    path::{Path, PathBuf},
     sync::{
         Arc,
         atomic::{AtomicBool, Ordering},
@@ -35,18 +37,27 @@ use std::{
 /// # Errors
 /// Wrong usage, a server that fails, a directory that cannot be written to.
 pub async fn run(args: CompareArgs) -> Result<(), CliError> {
-    let job = Job::new(&args)?;
+    let mut job = Job::new(&args)?;
     let narrator = Narrator::new(args.json);
     let environments = Environments::start(args.env_addr.as_deref(), &args.access).await?;
     let outcome = async {
-        let compared = compare(&job, &environments.connection, narrator, |style| {
+        let directory = |env_id: &str, style: &str| {
             if let Some(out) = &args.out {
                 return Ok(out.clone());
             }
-            let name = super::fit::directory_name(&["compare", &job.env_id, style]);
+            let name = super::fit::directory_name(&["compare", env_id, style]);
             Ok(data_directory(args.data.clone())?.join("reports").join(name))
-        });
-        let (comparison, out) = compared.await?;
+        };
+        let served = environments.connection.list_environments().await?;
+        let known = served.iter().any(|spec| spec.env_id == job.env_id);
+        let stored = if known { None } else { recorded::find(&mut job, args.data.clone(), narrator).await? };
+        let (comparison, out) = if let Some((ground, style, seeds)) = stored {
+            let out = directory(&job.env_id, &style)?;
+            (compare_on(&job, ground, seeds, &out, narrator).await?, out)
+        } else {
+            let env_id = job.env_id.clone();
+            compare(&job, &environments.connection, narrator, |style| directory(&env_id, style)).await?
+        };
         let written = output::write(&job, &comparison, &out)?;
         if args.json {
             let text = output::json(&comparison) + "\n";
@@ -77,17 +88,30 @@ pub async fn compare(
     let scene =
         Scene::open(environments, &job.env_id, job.env_options.clone(), job.style.as_deref(), job.discount()).await?;
     let out = directory(&scene.style)?;
-    std::fs::create_dir_all(&out).map_err(|error| {
+    narrator.step("model", super::fit::describe(&scene.model))?;
+    let seeds = demonstrations(job, &scene, narrator).await?;
+    let Scene { model, mdp, truth, .. } = scene;
+    let ground = Ground { model, mdp, truth, features: None };
+    Ok((compare_on(job, ground, seeds, &out, narrator).await?, out))
+}
+
+/// As [`compare`], on demonstrations that are there.
+async fn compare_on(
+    job: &Job,
+    ground: Ground,
+    seeds: Vec<Seed>,
+    out: &Path,
+    narrator: Narrator,
+) -> Result<Comparison, CliError> {
+    std::fs::create_dir_all(out).map_err(|error| {
         CliError::failure(
             format!("cannot make {}: {error}", out.display()),
             "choose a directory that you may write to with --out DIR",
         )
     })?;
-    let (journal, known) = Journal::open(&out)?;
-    narrator.step("model", super::fit::describe(&scene.model))?;
-    let seeds = demonstrations(job, &scene, narrator).await?;
+    let (journal, known) = Journal::open(out)?;
 
-    let grid = Arc::new(Grid::new(job, scene, seeds));
+    let grid = Arc::new(Grid::new(job, ground, seeds));
     let (mut cells, mut tasks) = (Vec::new(), Vec::new());
     for task in grid.tasks(&job.trajectories) {
         match known.get(&task.key) {
@@ -101,7 +125,7 @@ pub async fn compare(
     }
     cells.extend(fits(job, &grid, tasks, cells.len(), journal, narrator).await?);
     let names: Vec<&str> = job.entries.iter().map(|entry| entry.name.as_str()).collect();
-    Ok((Comparison::new(&cells, &names, &job.trajectories, &job.baseline), out))
+    Ok(Comparison::new(&cells, &names, &job.trajectories, &job.baseline))
 }
 
 /// One list of demonstrations a seed, and what its fits are judged by.

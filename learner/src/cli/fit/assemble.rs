@@ -170,7 +170,7 @@ pub fn report(parts: Parts<'_>) -> Result<Report, CliError> {
         n_actions: model.n_actions,
         state_labels: model.state_labels,
         action_labels: model.action_labels,
-        trajectories: fit.trajectory_ids.len() as u64,
+        trajectories: fit.trajectories,
         steps: fit.steps,
         sources,
         state_visits: learned.state_visits,

@@ -12,7 +12,7 @@ use super::{
     learn,
     narrate::Narrator,
     recordings::Recordings,
-    services::Services,
+    services::{Services, sources},
 };
 use crate::cli::{error::CliError, models, scene};
 use mazeway_client::{Code, FeatureDomain, Learner, Model, packed::Packed};
@@ -37,7 +37,7 @@ pub async fn fit(
     begun: Instant,
 ) -> Result<(Report, PathBuf), CliError> {
     let learner = services.learner();
-    let style = style(job, learner).await?;
+    let style = style(&job.env_id, job.style.as_deref(), learner).await?;
     let spinner = narrator.spinner("model");
     let (model, count) = match &job.model {
         Some(AskedModel::Estimate(prior)) => (estimate(job, *prior, learner).await?, 1),
@@ -67,12 +67,11 @@ pub async fn fit(
 
     let fit = learn(job, &model, &recordings, services, narrator).await?;
     let learned = Learned::new(&fit)?;
-    let seen = pair_counts(&fit, &recordings, &mdp, learner).await?;
-    let longest = seen.1;
-    let features = features(&model, &mdp, &fit, &learned, seen)?;
+    let features = features(&model, &mdp, &fit, &learned)?;
+    let longest = fit.longest;
     let fitted = Fitted { job, spec: None, style: &style, model: &model, mdp: &mdp, fit: &fit, learned: &learned };
     let answers = judge::answer(extras, &fitted, services, narrator).await?;
-    let sources = services.sources(&recordings).await?;
+    let sources = sources(&fit);
     let out = match &args.out {
         Some(out) => out.clone(),
         None => services.data().join("reports").join(directory_name(&[&job.env_id, &style, job.method])),
@@ -97,11 +96,14 @@ pub async fn fit(
 }
 
 /// The style that is asked for, or the only one that is recorded.
-async fn style(job: &Job, learner: &Learner) -> Result<String, CliError> {
-    if let Some(style) = &job.style {
-        return Ok(style.clone());
+///
+/// # Errors
+/// There is none, or several are; the learner fails.
+pub async fn style(env_id: &str, asked: Option<&str>, learner: &Learner) -> Result<String, CliError> {
+    if let Some(style) = asked {
+        return Ok(style.to_owned());
     }
-    let filter = TrajectoryFilter { env_id: job.env_id.clone(), ..TrajectoryFilter::default() };
+    let filter = TrajectoryFilter { env_id: env_id.to_owned(), ..TrajectoryFilter::default() };
     let (mut styles, mut token) = (BTreeSet::new(), String::new());
     loop {
         let page = learner.list_trajectories_page(&filter, PAGE, &token).await?;
@@ -115,7 +117,7 @@ async fn style(job: &Job, learner: &Learner) -> Result<String, CliError> {
     match (all.next(), all.next()) {
         (Some(one), None) => Ok(one.clone()),
         (None, _) => Err(CliError::failure(
-            format!("nothing is recorded for {}", job.env_id),
+            format!("nothing is recorded for {env_id}"),
             "import demonstrations with 'learner import FILE'",
         )),
         (Some(_), Some(_)) => {
@@ -231,13 +233,7 @@ fn say_unseen(model: &Model, narrator: Narrator) -> Result<(), CliError> {
 }
 
 /// What the fit makes of the features: their weights, and how much of each there is a step, seen, learned and at random.
-fn features(
-    model: &Model,
-    mdp: &TabularMdp,
-    fit: &Fit,
-    learned: &Learned,
-    (seen, longest): (Vec<f64>, u32),
-) -> Result<Vec<FeatureRow>, CliError> {
+fn features(model: &Model, mdp: &TabularMdp, fit: &Fit, learned: &Learned) -> Result<Vec<FeatureRow>, CliError> {
     let Some(table) = model.features.as_ref().filter(|_| !fit.feature_names.is_empty()) else { return Ok(Vec::new()) };
     let wrong = |what: &str| {
         CliError::failure(
@@ -249,6 +245,8 @@ fn features(
     let weights =
         array(&fit.weights).filter(|w| w.len() == fit.feature_names.len()).ok_or_else(|| wrong("its weights"))?;
     let n_actions = mdp.n_actions();
+    let seen = array(&fit.pair_visits).filter(|n| n.len() == mdp.n_pairs()).ok_or_else(|| wrong("its visits"))?;
+    let longest = fit.longest;
     let greedy = Policy::new(n_actions, learned.greedy_policy.clone()).map_err(|error| wrong(&error.to_string()))?;
     let random = Policy::uniform(mdp.n_states(), n_actions);
     let flow = |policy: &Policy| state_action_occupancy(policy, &finite_horizon_occupancy(mdp, policy, 1.0, longest));
@@ -286,33 +284,4 @@ fn features(
         })
     };
     fit.feature_names.iter().enumerate().map(row).collect()
-}
-
-/// How often each pair was demonstrated, and the steps of the longest demonstration, as the fit took them.
-async fn pair_counts(
-    fit: &Fit,
-    recordings: &Recordings,
-    mdp: &TabularMdp,
-    learner: &Learner,
-) -> Result<(Vec<f64>, u32), CliError> {
-    let steps = recordings.horizon.map_or(usize::MAX, |horizon| horizon as usize);
-    let (mut counts, mut longest, mut left) = (vec![0.0; mdp.n_pairs()], 1, fit.trajectory_ids.len());
-    let mut pages = learner.export_trajectories(&recordings.filter).await?;
-    while let Some(page) = pages.next().await? {
-        for t in page.into_iter().take(left) {
-            left -= 1;
-            let arrays = Packed::<u32>::new(t.states).zip(Packed::<u32>::new(t.actions));
-            let Some((states, actions)) = arrays else { continue };
-            longest = longest.max(states.len().min(steps) as u32);
-            for (state, action) in states.iter().zip(actions.iter()).take(steps) {
-                if let Some(count) = counts.get_mut(state as usize * mdp.n_actions() + action as usize) {
-                    *count += 1.0;
-                }
-            }
-        }
-        if left == 0 {
-            break;
-        }
-    }
-    Ok((counts, longest))
 }

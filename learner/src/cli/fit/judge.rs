@@ -105,7 +105,7 @@ pub async fn answer(
     }
     let request = fitted.fit.request.clone().unwrap_or_default();
     let options = mazeway_learner::fit_options(request.options.as_ref()).map_err(|error| wrong(&error))?;
-    let trajectories = services.trajectories(&request.filter.unwrap_or_default(), &fitted.fit.trajectory_ids).await?;
+    let trajectories = services.trajectories(fitted.fit).await?;
     let validation = match extras.folds {
         None => None,
         Some(folds) => {
@@ -264,7 +264,10 @@ async fn target(
 }
 
 /// The users' features of a model, as the mathematics takes them.
-fn features_of(model: &Model) -> Result<Option<Features>, CliError> {
+///
+/// # Errors
+/// They do not belong to it.
+pub fn features_of(model: &Model) -> Result<Option<Features>, CliError> {
     let Some(table) = &model.features else { return Ok(None) };
     let (n_states, n_actions) = (model.n_states as usize, model.n_actions as usize);
     let features = match table.domain {

@@ -6,13 +6,13 @@
 mod args;
 pub mod assemble;
 mod evaluate;
-mod imported;
+pub mod imported;
 pub mod job;
-mod judge;
+pub mod judge;
 pub mod learning;
 pub mod narrate;
 pub mod recordings;
-mod services;
+pub mod services;
 
 pub use args::FitArgs;
 
@@ -116,7 +116,7 @@ async fn fit(
         Fitted { job, spec: Some(&spec), style: &style, model: &model, mdp: &mdp, fit: &fit, learned: &learned };
     let answers = judge::answer(extras, &fitted, services, narrator).await?;
     let frame = evaluate::frame(job, &learned.greedy_policy, policies.n_actions, services).await?;
-    let sources = services.sources(&recordings).await?;
+    let sources = services::sources(&fit);
 
     let out = match &args.out {
         Some(out) => out.clone(),
@@ -171,7 +171,7 @@ async fn learn(
         format_args!(
             "{} on {} trajectories in {}; fit {}",
             job.method,
-            fit.trajectory_ids.len(),
+            fit.trajectories,
             report::duration(fit.fit_secs),
             fit.fit_id,
         ),

@@ -1,7 +1,7 @@
 //! The two services behind a fit: running ones where addresses are given, else the real ones started in process on loopback
 //! ports. Everything else in `learner fit` sees a connection and not how it came about.
 
-use super::{args::FitArgs, job::Job, narrate::Narrator, recordings::Recordings};
+use super::{args::FitArgs, job::Job, narrate::Narrator};
 use crate::cli::{
     data_directory,
     embedded::{self, Embedded},
@@ -13,10 +13,7 @@ use mazeway_client::{
 };
 use mazeway_learner::report::Source;
 use mazeway_proto::learner::{Fit, FitProgress, FitRequest, Trajectory, TrajectoryFilter};
-use std::{
-    collections::BTreeMap,
-    path::{Path, PathBuf},
-};
+use std::path::{Path, PathBuf};
 
 /// Port of an environment server beside a learner service, where none is named.
 const ENVIRONMENTS_PORT: u16 = 50051;
@@ -164,28 +161,22 @@ impl Services {
         Ok(Env::create(self.environments()?, env_id, options).await?)
     }
 
-    /// Trajectories by id, in the order of the ids, all of which the filter selects.
+    /// The trajectories that a fit used, in the order used.
     ///
     /// # Errors
     /// The learner fails, or has lost one.
-    pub async fn trajectories(
-        &self,
-        filter: &TrajectoryFilter,
-        ids: &[String],
-    ) -> Result<Vec<mazeway_learner::trajectory::Trajectory>, CliError> {
-        let mut found = std::collections::HashMap::new();
-        let mut stream = self.learner.export_trajectories(filter).await?;
-        let wanted: std::collections::HashSet<&str> = ids.iter().map(String::as_str).collect();
-        while found.len() < wanted.len() {
-            let Some(part) = stream.next().await? else { break };
-            for trajectory in part.into_iter().filter(|trajectory| wanted.contains(trajectory.trajectory_id.as_str())) {
-                let checked = checked(&trajectory)?;
-                found.insert(trajectory.trajectory_id, checked);
+    pub async fn trajectories(&self, fit: &Fit) -> Result<Vec<mazeway_learner::trajectory::Trajectory>, CliError> {
+        let mut found = Vec::new();
+        let mut stream = self.learner.export_fit_trajectories(&fit.fit_id, &TrajectoryFilter::default()).await?;
+        while let Some(part) = stream.next().await? {
+            for trajectory in part {
+                found.push(checked(&trajectory)?);
             }
         }
-        let lost =
-            || CliError::failure("the trajectories of the fit are gone", "see what is stored with 'learner list'");
-        ids.iter().map(|id| found.remove(id).ok_or_else(lost)).collect()
+        if found.len() as u64 == fit.trajectories {
+            return Ok(found);
+        }
+        Err(CliError::failure("the trajectories of the fit are gone", "see what is stored with 'learner list'"))
     }
 
     /// How many recordings a filter selects.
@@ -225,27 +216,21 @@ impl Services {
             _ => error.into(),
         })
     }
+}
 
-    /// Where the recordings that a fit used came from, and how many from each.
-    ///
-    /// # Errors
-    /// The learner fails.
-    pub async fn sources(&self, recordings: &Recordings) -> Result<Vec<Source>, CliError> {
-        let one = &recordings.filter.source;
-        if !one.is_empty() {
-            return Ok(vec![Source { name: one.clone(), trajectories: u64::from(recordings.trajectories) }]);
-        }
-        let mut counts = BTreeMap::<String, u64>::new();
-        let used = self.learner.list_trajectories(&recordings.filter).await?;
-        for summary in used.into_iter().take(recordings.trajectories as usize) {
-            *counts.entry(summary.source).or_default() += 1;
-        }
-        Ok(counts.into_iter().map(|(name, trajectories)| Source { name, trajectories }).collect())
-    }
+/// Where the recordings that a fit used came from, and how many from each, by name.
+pub fn sources(fit: &Fit) -> Vec<Source> {
+    let mut sources: Vec<Source> =
+        fit.sources.iter().map(|s| Source { name: s.source.clone(), trajectories: s.trajectories }).collect();
+    sources.sort_by(|a, b| a.name.cmp(&b.name));
+    sources
 }
 
 /// A trajectory as the mathematics takes it.
-fn checked(trajectory: &Trajectory) -> Result<mazeway_learner::trajectory::Trajectory, CliError> {
+///
+/// # Errors
+/// Its arrays are torn, or it is none.
+pub fn checked(trajectory: &Trajectory) -> Result<mazeway_learner::trajectory::Trajectory, CliError> {
     let broken = |message: String| {
         CliError::failure(message, "the learner is of another release, or its data directory is damaged")
     };

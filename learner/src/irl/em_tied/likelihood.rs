@@ -110,7 +110,7 @@ impl<'a> Likelihood<'a> {
         self.solver.solve(&self.basis.reward(weights));
         let (mdp, n_basis, n_actions) = (self.mdp, self.basis.len(), self.mdp.n_actions());
         let policy = self.solver.policy();
-        let resolvent = Resolvent::new(mdp, policy, self.discount);
+        let mut resolvent = Resolvent::new(mdp, policy, self.discount);
         let v = resolvent.solve_transposed(&self.value_weights);
         let mut received = vec![vec![0.0; mdp.n_states()]; n_basis];
         for (pair, &p) in policy.iter().enumerate() {

@@ -1,12 +1,10 @@
-//! Sparse LU of I − γP_π without pivots, in an order of minimum degree.
+//! Sparse LU of I − γP_π without pivots, in an order of approximate minimum degree (Amestoy, Davis & Duff 1996).
 //!
 //! The order and the fill depend on the model alone (on the pattern of M + Mᵀ, so that L and Uᵀ share it) and are found
-//! once; a policy costs the numbers. The order is the plain greedy one (Tinney & Walker 1967) on the elimination graph
-//! itself: for the few thousand states that are factored at all, quotient graphs save nothing.
+//! once; a policy costs the numbers. The order is the crate `amd`'s; the fill follows from it along the elimination tree
+//! (Liu 1990), and is known before any memory is taken for it.
 
 use super::pattern::Matrix;
-use std::cmp::Reverse;
-use std::collections::BinaryHeap;
 
 /// Order of elimination and pattern of the factors.
 #[derive(Clone)]
@@ -30,113 +28,98 @@ impl Rows {
     fn range(&self, row: usize) -> std::ops::Range<usize> {
         self.offsets[row]..self.offsets[row + 1]
     }
+
+    fn transposed(&self) -> Self {
+        let n = self.offsets.len() - 1;
+        let mut offsets = vec![0; n + 1];
+        for &column in &self.columns {
+            offsets[column as usize + 1] += 1;
+        }
+        for row in 0..n {
+            offsets[row + 1] += offsets[row];
+        }
+        let mut next = offsets.clone();
+        let mut columns = vec![0; self.columns.len()];
+        for row in 0..n {
+            for &column in &self.columns[self.range(row)] {
+                columns[next[column as usize]] = row as u32;
+                next[column as usize] += 1;
+            }
+        }
+        Self { offsets, columns }
+    }
 }
 
 impl Symbolic {
     /// None where the factorisation would take more than `bearable` multiplications.
-    pub(super) fn minimum_degree(matrix: &Matrix, bearable: u64) -> Option<Self> {
+    pub(super) fn of(matrix: &Matrix, bearable: u64) -> Option<Self> {
         let n = matrix.n_states();
-        let mut neighbours: Vec<Vec<u32>> = vec![Vec::new(); n];
-        for state in 0..n {
-            for &s in matrix.row(state).0 {
-                if s as usize != state {
-                    neighbours[state].push(s);
-                    neighbours[s as usize].push(state as u32);
-                }
-            }
-        }
-        let mut queue = BinaryHeap::with_capacity(2 * n);
-        for (state, all) in neighbours.iter_mut().enumerate() {
-            all.sort_unstable();
-            all.dedup();
-            queue.push(Reverse((all.len(), state as u32)));
-        }
-        let mut order = Vec::with_capacity(n);
-        let mut eliminated = vec![false; n];
-        let mut structure: Vec<Vec<u32>> = Vec::with_capacity(n);
-        let mut multiplications = 0_u64;
-        let mut merged = Vec::new();
-        while let Some(Reverse((degree, state))) = queue.pop() {
-            let v = state as usize;
-            if eliminated[v] || neighbours[v].len() != degree {
-                continue;
-            }
-            multiplications += (degree * degree) as u64;
-            if multiplications > bearable {
-                return None;
-            }
-            if degree + 1 == n - order.len() {
-                // what is left is one clique: any order is as good
-                multiplications += (0..degree as u64).map(|d| d * d).sum::<u64>();
-                if multiplications > bearable {
-                    return None;
-                }
-                let left: Vec<u32> = (0..n as u32).filter(|&s| !eliminated[s as usize]).collect();
-                structure.extend((0..left.len()).map(|first| left[first + 1..].to_vec()));
-                order.extend(left);
-                break;
-            }
-            eliminated[v] = true;
-            order.push(state);
-            let clique = std::mem::take(&mut neighbours[v]);
-            for &u in &clique {
-                merge(&neighbours[u as usize], &clique, u, state, &mut merged);
-                if merged != neighbours[u as usize] {
-                    queue.push(Reverse((merged.len(), u)));
-                    std::mem::swap(&mut neighbours[u as usize], &mut merged);
-                }
-            }
-            structure.push(clique);
-        }
-        let mut place = vec![0; n];
-        for (at, &state) in order.iter().enumerate() {
-            place[state as usize] = at as u32;
-        }
-        Some(Self::from_structure(order, place, structure))
+        let offsets = matrix.offsets().iter().map(|&at| at as i64).collect::<Vec<_>>();
+        let columns = matrix.columns().iter().map(|&column| i64::from(column)).collect::<Vec<_>>();
+        let (order, place, _) = amd::order(n as i64, &offsets, &columns, &amd::Control::default()).ok()?;
+        let order: Vec<u32> = order.into_iter().map(|state| state as u32).collect();
+        let place: Vec<u32> = place.into_iter().map(|at| at as u32).collect();
+        let upper = fill(matrix, &order, &place, bearable)?;
+        Some(Self { lower: upper.transposed(), order, place, upper })
     }
 
-    fn from_structure(order: Vec<u32>, place: Vec<u32>, structure: Vec<Vec<u32>>) -> Self {
-        let n = order.len();
-        let mut upper = Rows { offsets: vec![0], columns: Vec::new() };
-        let mut in_row = vec![0; n + 1];
-        for row in structure {
-            let begin = upper.columns.len();
-            upper.columns.extend(row.iter().map(|&s| place[s as usize]));
-            upper.columns[begin..].sort_unstable();
-            upper.offsets.push(upper.columns.len());
-            for &column in &upper.columns[begin..] {
-                in_row[column as usize + 1] += 1;
-            }
-        }
-        for row in 0..n {
-            in_row[row + 1] += in_row[row];
-        }
-        // L has the pattern of Uᵀ
-        let mut lower = Rows { offsets: in_row.clone(), columns: vec![0; upper.columns.len()] };
-        for row in 0..n {
-            for &column in &upper.columns[upper.range(row)] {
-                lower.columns[in_row[column as usize]] = row as u32;
-                in_row[column as usize] += 1;
-            }
-        }
-        Self { order, place, upper, lower }
+    /// Multiplications of a factorisation.
+    pub(super) fn multiplications(&self) -> u64 {
+        self.upper.offsets.windows(2).map(|row| ((row[1] - row[0]) as u64).pow(2)).sum()
+    }
+
+    /// Entries of both factors without the diagonal.
+    pub(super) fn n_entries(&self) -> usize {
+        2 * self.upper.columns.len()
     }
 }
 
-/// (a ∪ clique) without u and v; both rise, and so does the result.
-fn merge(a: &[u32], clique: &[u32], u: u32, v: u32, out: &mut Vec<u32>) {
-    out.clear();
-    let (mut i, mut j) = (0, 0);
-    while i < a.len() || j < clique.len() {
-        let left = a.get(i).copied().unwrap_or(u32::MAX);
-        let right = clique.get(j).copied().unwrap_or(u32::MAX);
-        let next = left.min(right);
-        i += usize::from(left == next);
-        j += usize::from(right == next);
-        if next != u && next != v {
-            out.push(next);
+/// Rows of U: what a place refers to, and what those that are eliminated before it and lead to it first leave it.
+fn fill(matrix: &Matrix, order: &[u32], place: &[u32], bearable: u64) -> Option<Rows> {
+    let n = order.len();
+    // places after each place that refer to it, or that it refers to
+    let mut neighbours: Vec<Vec<u32>> = vec![Vec::new(); n];
+    for state in 0..n {
+        let at = place[state];
+        for &s in matrix.row(state).0 {
+            let other = place[s as usize];
+            if other != at {
+                neighbours[at.min(other) as usize].push(at.max(other));
+            }
         }
     }
+    let mut upper = Rows { offsets: Vec::with_capacity(n + 1), columns: Vec::new() };
+    upper.offsets.push(0);
+    let mut children: Vec<Vec<u32>> = vec![Vec::new(); n];
+    let mut seen = vec![u32::MAX; n];
+    let mut multiplications = 0_u64;
+    for at in 0..n {
+        let begin = upper.columns.len();
+        seen[at] = at as u32;
+        for column in std::mem::take(&mut neighbours[at]) {
+            if std::mem::replace(&mut seen[column as usize], at as u32) != at as u32 {
+                upper.columns.push(column);
+            }
+        }
+        for child in std::mem::take(&mut children[at]) {
+            for entry in upper.range(child as usize) {
+                let column = upper.columns[entry];
+                if std::mem::replace(&mut seen[column as usize], at as u32) != at as u32 {
+                    upper.columns.push(column);
+                }
+            }
+        }
+        multiplications += ((upper.columns.len() - begin) as u64).pow(2);
+        if multiplications > bearable {
+            return None;
+        }
+        upper.columns[begin..].sort_unstable();
+        if let Some(&parent) = upper.columns.get(begin) {
+            children[parent as usize].push(at as u32);
+        }
+        upper.offsets.push(upper.columns.len());
+    }
+    Some(upper)
 }
 
 /// L (unit diagonal) and U of M in the order of a [`Symbolic`].
@@ -184,6 +167,11 @@ impl Factor {
                 *u = std::mem::take(&mut work[column as usize]);
             }
         }
+    }
+
+    /// The order and pattern.
+    pub(super) fn symbolic(&self) -> &Symbolic {
+        &self.symbolic
     }
 
     /// x of M x = b or Mᵀ x = b.

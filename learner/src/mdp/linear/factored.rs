@@ -18,7 +18,7 @@ impl Factored {
     /// Solves nothing before [`Factored::set_policy`].
     pub(crate) fn of_model(mdp: &TabularMdp, discount: f64, bearable: u64) -> Option<Self> {
         let matrix = Matrix::of_model(mdp);
-        let factor = Factor::new(Symbolic::minimum_degree(&matrix, bearable)?);
+        let factor = Factor::new(Symbolic::of(&matrix, bearable)?);
         Some(Self { discount, factor, work: vec![0.0; matrix.n_states()], matrix })
     }
 

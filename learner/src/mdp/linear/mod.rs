@@ -2,10 +2,14 @@
 //!
 //! The pattern of M is merged from the model's rows once; a policy only fills in the numbers. Where elimination in a good
 //! order stays about as sparse as the model (small models, mazes) M is factored (`direct`); otherwise it is solved by
-//! preconditioned BiCGSTAB (`iterative`), because a sweep-by-sweep solution would need 1/(1 − γ) times as many passes. Where
-//! the iteration does not reach its tolerance, the factorisation takes over if its fill is bearable, and plain sweeps with
-//! the incomplete factorisation if not. Every solution comes with its true residual. Memory is proportional to the
-//! transitions of the model, but for the factorisation, whose fill is bounded.
+//! preconditioned BiCGSTAB (`iterative`), because a sweep-by-sweep solution would need 1/(1 − γ) times as many passes.
+//!
+//! Where the incomplete factorisation, the cheap preconditioner, has cost as many iterations as a whole one takes time, the
+//! whole one is made (`lasting`), and serves for the policies that follow as well, which are seldom far away: it is made anew
+//! once its age has cost as much as itself. What is counted are operations, not seconds: the same calls give the same
+//! numbers. Where even a whole factorisation is too much, plain sweeps with the incomplete one improve what there is, in a
+//! bounded number of passes. Every solution comes with its true residual. Memory is proportional to the transitions of the
+//! model, but for the factorisation, whose fill is bounded.
 //!
 //! M is a strictly diagonally dominant M-matrix for γ < 1, so neither factorisation needs pivots (Meijerink & van der Vorst
 //! 1977), and the order of elimination is free. Deliberately absent: threads; one solve is one core's work.
@@ -13,12 +17,13 @@
 mod direct;
 mod factored;
 mod iterative;
+mod lasting;
 mod pattern;
 
 use super::tabular::TabularMdp;
 use direct::{Factor, Symbolic};
 pub(crate) use factored::Factored;
-use iterative::Incomplete;
+use lasting::Iterative;
 use pattern::Matrix;
 
 /// Up to this many states an order of elimination is looked for at once.
@@ -28,8 +33,6 @@ const DIRECT_MULTIPLICATIONS: u64 = 50_000;
 /// … and so is one of this many times the entries of the matrix, for each decade that 1 − γ lies below 1 beyond the first:
 /// the passes of an iteration that it replaces.
 const DIRECT_PER_ENTRY: f64 = 100.0;
-/// What a factorisation may cost that replaces a failed iteration: some seconds, 128 MB of fill.
-const FALLBACK_MULTIPLICATIONS: u64 = 4_000_000_000;
 /// Wanted residual, relative to the right-hand side.
 const RELATIVE_TOLERANCE: f64 = 1e-13;
 
@@ -51,7 +54,7 @@ pub(crate) struct Resolvent {
 
 enum Solver {
     Direct(Factor),
-    Iterative(Incomplete),
+    Iterative(Box<Iterative>),
 }
 
 impl Resolvent {
@@ -67,11 +70,10 @@ impl Resolvent {
         let matrix = Matrix::of_model(mdp);
         let decades = (-(1.0 - discount).log10() - 1.0).max(0.0);
         let bearable = DIRECT_MULTIPLICATIONS.max((DIRECT_PER_ENTRY * decades * matrix.n_entries() as f64) as u64);
-        let symbolic =
-            if matrix.n_states() <= DIRECT_STATES { Symbolic::minimum_degree(&matrix, bearable) } else { None };
+        let symbolic = if matrix.n_states() <= DIRECT_STATES { Symbolic::of(&matrix, bearable) } else { None };
         let solver = match symbolic {
             Some(symbolic) => Solver::Direct(Factor::new(symbolic)),
-            None => Solver::Iterative(Incomplete::default()),
+            None => Solver::Iterative(Box::default()),
         };
         Self { discount, matrix, solver }
     }
@@ -81,53 +83,38 @@ impl Resolvent {
         self.matrix.fill(mdp, policy, self.discount);
         match &mut self.solver {
             Solver::Direct(factor) => factor.factorise(&self.matrix),
-            Solver::Iterative(incomplete) => incomplete.factorise(&self.matrix),
+            Solver::Iterative(iterative) => iterative.set_policy(&self.matrix),
         }
     }
 
     /// x of (I − γP_π) x = b, shape (`n_states`,).
-    pub(crate) fn solve(&self, b: &[f64]) -> Vec<f64> {
+    pub(crate) fn solve(&mut self, b: &[f64]) -> Vec<f64> {
         self.solution(b, false, RELATIVE_TOLERANCE, None).x
     }
 
     /// As [`Resolvent::solve`], to a residual of `tolerance` relative to b where that saves time.
-    pub(crate) fn solve_roughly(&self, b: &[f64], tolerance: f64) -> Solution {
+    pub(crate) fn solve_roughly(&mut self, b: &[f64], tolerance: f64) -> Solution {
         self.solution(b, false, tolerance.max(RELATIVE_TOLERANCE), None)
     }
 
     /// x of (I − γP_π)ᵀ x = b, shape (`n_states`,).
-    pub(crate) fn solve_transposed(&self, b: &[f64]) -> Vec<f64> {
+    pub(crate) fn solve_transposed(&mut self, b: &[f64]) -> Vec<f64> {
         self.solve_transposed_from(b, None).x
     }
 
     /// As [`Resolvent::solve_transposed`], with its residual, and where that saves time from the solution of a similar system
     /// on.
-    pub(crate) fn solve_transposed_from(&self, b: &[f64], start: Option<&[f64]>) -> Solution {
+    pub(crate) fn solve_transposed_from(&mut self, b: &[f64], start: Option<&[f64]>) -> Solution {
         self.solution(b, true, RELATIVE_TOLERANCE, start)
     }
 
-    fn solution(&self, b: &[f64], transposed: bool, tolerance: f64, start: Option<&[f64]>) -> Solution {
-        let x = match &self.solver {
+    fn solution(&mut self, b: &[f64], transposed: bool, tolerance: f64, start: Option<&[f64]>) -> Solution {
+        let x = match &mut self.solver {
             Solver::Direct(factor) => factor.solve(b, transposed),
-            Solver::Iterative(incomplete) => {
-                let (x, converged) = incomplete.bicgstab(&self.matrix, b, transposed, tolerance, start);
-                if converged { x } else { self.laboriously(incomplete, b, transposed, x) }
-            }
+            Solver::Iterative(iterative) => iterative.solve(&self.matrix, b, transposed, tolerance, start),
         };
         let residual = self.matrix.relative_residual(&x, b, transposed);
         Solution { x, residual }
-    }
-
-    fn laboriously(&self, incomplete: &Incomplete, b: &[f64], transposed: bool, x: Vec<f64>) -> Vec<f64> {
-        tracing::debug!(states = b.len(), "the iteration did not converge");
-        match Symbolic::minimum_degree(&self.matrix, FALLBACK_MULTIPLICATIONS) {
-            Some(symbolic) => {
-                let mut factor = Factor::new(symbolic);
-                factor.factorise(&self.matrix);
-                factor.solve(b, transposed)
-            }
-            None => incomplete.sweeps(&self.matrix, b, transposed, x, RELATIVE_TOLERANCE),
-        }
     }
 }
 

@@ -1,6 +1,8 @@
 //! All ways to solve against a dense factorisation, on random sparse models.
 
+use super::iterative::{Incomplete, Patience, bicgstab};
 use super::*;
+use crate::mdp::numeric::norm;
 use nalgebra::{DMatrix, DVector};
 use proptest::prelude::*;
 use rand_core::Rng;
@@ -66,24 +68,39 @@ proptest! {
         let want = full.clone().lu().solve(&side).expect("M is regular");
         let size = want.amax();
 
-        let chosen = Resolvent::new(&mdp, &policy, discount);
-        let mut factor = Factor::new(Symbolic::minimum_degree(&chosen.matrix, u64::MAX).expect("an order"));
+        let mut chosen = Resolvent::new(&mdp, &policy, discount);
+        let mut factor = Factor::new(Symbolic::of(&chosen.matrix, u64::MAX).expect("an order"));
         factor.factorise(&chosen.matrix);
         let mut incomplete = Incomplete::default();
         incomplete.factorise(&chosen.matrix);
-        let (iterated, converged) = incomplete.bicgstab(&chosen.matrix, &b, transposed, RELATIVE_TOLERANCE, None);
-        prop_assert!(converged);
         let near = want.iter().map(|x| x * (1.0 + 1e-6)).collect::<Vec<_>>();
-        let (from_near, converged) =
-            incomplete.bicgstab(&chosen.matrix, &b, transposed, RELATIVE_TOLERANCE, Some(&near));
-        prop_assert!(converged);
-        let swept = incomplete.sweeps(&chosen.matrix, &b, transposed, near, RELATIVE_TOLERANCE);
+        let patience = Patience { most: 10_000, minds_pace: false };
+        let iterate = |start| {
+            let matrix = (&chosen.matrix, &incomplete);
+            let iterated = bicgstab(matrix, &b, transposed, RELATIVE_TOLERANCE, start, patience);
+            assert!(iterated.converged, "{} iterations", iterated.iterations);
+            iterated.x
+        };
+        let (iterated, from_near) = (iterate(None), iterate(Some(&near)));
+        let swept = incomplete.sweeps(&chosen.matrix, &b, transposed, near, RELATIVE_TOLERANCE, 20_000);
+        // as if the model were large, after another policy, and with a factorisation that is forced early
+        let mut lasting = Iterative::default();
+        let mut other = Matrix::of_model(&mdp);
+        other.fill(&mdp, &vec![0.5; 2 * n], discount);
+        lasting.set_policy(&other);
+        lasting.solve(&other, &b, transposed, RELATIVE_TOLERANCE, None);
+        if seed % 2 == 0 {
+            lasting.buy(&other);
+        }
+        lasting.set_policy(&chosen.matrix);
+        let lasted = lasting.solve(&chosen.matrix, &b, transposed, RELATIVE_TOLERANCE, None);
         let solution = chosen.solution(&b, transposed, RELATIVE_TOLERANCE, None);
         for (way, found) in [
             ("factor", factor.solve(&b, transposed)),
             ("bicgstab", iterated),
             ("from near", from_near),
             ("sweeps", swept),
+            ("lasting", lasted),
             ("chosen", solution.x.clone()),
         ] {
             for (w, x) in want.iter().zip(&found) {
@@ -123,7 +140,74 @@ fn large_models_are_iterated_and_their_patterns_reused() {
 #[test]
 fn nothing_to_solve() {
     let mdp = TabularMdp::new(1, 1, vec![0, 1], vec![0], vec![1.0], None).expect("a model");
-    let resolvent = Resolvent::new(&mdp, &[1.0], 0.75);
+    let mut resolvent = Resolvent::new(&mdp, &[1.0], 0.75);
     assert_eq!(resolvent.solve(&[1.0]), [4.0]);
     assert_eq!(resolvent.solve_transposed_from(&[0.0], None), Solution { x: vec![0.0], residual: 0.0 });
+}
+
+/// Chains that hardly mix: cliques of states between which a step leads with probability 1e-9.
+fn cliques(n_cliques: usize, size: usize) -> TabularMdp {
+    let n = n_cliques * size;
+    let (mut offsets, mut next, mut probabilities) = (vec![0], Vec::new(), Vec::new());
+    for state in 0..n {
+        let clique = state / size;
+        let leap = ((clique + 1) % n_cliques * size + state % size) as u32;
+        let mut row: Vec<(u32, f64)> =
+            (0..size).map(|i| ((clique * size + i) as u32, (1.0 - 1e-9) / size as f64)).collect();
+        row.push((leap, 1e-9));
+        row.sort_by_key(|entry| entry.0);
+        next.extend(row.iter().map(|entry| entry.0));
+        probabilities.extend(row.iter().map(|entry| entry.1));
+        offsets.push(next.len());
+    }
+    TabularMdp::new(n, 1, offsets, next, probabilities, None).expect("a model")
+}
+
+#[test]
+fn nearly_singular_chains_end_with_a_small_residual() {
+    // more states than are factored at once
+    let mdp = cliques(700, 9);
+    let mut random = Pcg64::new(9, 9);
+    let b: Vec<f64> = (0..mdp.n_states()).map(|_| (random.next_u64() % 100) as f64).collect();
+    for discount in [0.9, 0.999, 0.9999, 1.0 - 1e-9] {
+        for transposed in [false, true] {
+            let mut resolvent = Resolvent::new(&mdp, &vec![1.0; mdp.n_states()], discount);
+            let solution = resolvent.solution(&b, transposed, RELATIVE_TOLERANCE, None);
+            let size = norm(&solution.x) / norm(&b);
+            assert!(solution.residual <= 1e-12 * (1.0 + size), "discount {discount}: {}", solution.residual);
+        }
+    }
+}
+
+#[test]
+fn what_is_too_much_to_factor_ends_all_the_same() {
+    // random leaps over many states: elimination fills everything
+    let mut random = Pcg64::new(5, 5);
+    let mdp = ring(12_000, 3, false, &mut random);
+    let policy = [1.0, 0.0].repeat(12_000);
+    let mut resolvent = Resolvent::new(&mdp, &policy, 0.9999);
+    assert!(Symbolic::of(&resolvent.matrix, 4_000_000_000).is_none());
+    let Solver::Iterative(iterative) = &mut resolvent.solver else { panic!("it is factored at once") };
+    iterative.buy(&resolvent.matrix);
+    let solution = resolvent.solution(&vec![1.0; 12_000], false, RELATIVE_TOLERANCE, None);
+    assert!(solution.residual < 1e-9, "{}", solution.residual);
+}
+
+#[test]
+fn a_factorisation_lasts_over_policies_that_are_near() {
+    let mut random = Pcg64::new(6, 6);
+    let mdp = ring(6000, 0, false, &mut random);
+    let b: Vec<f64> = (0..6000).map(|i| f64::from(i).sin()).collect();
+    let mut resolvent = Resolvent::of_model(&mdp, 0.999);
+    for turn in 0..20 {
+        let first = 0.5 + 0.02 * f64::from(turn);
+        resolvent.set_policy(&mdp, &[first, 1.0 - first].repeat(6000));
+        if let (0, Solver::Iterative(iterative)) = (turn, &mut resolvent.solver) {
+            iterative.buy(&resolvent.matrix);
+        }
+        for transposed in [false, true] {
+            let solution = resolvent.solution(&b, transposed, RELATIVE_TOLERANCE, None);
+            assert!(solution.residual < 1e-12, "turn {turn}: {}", solution.residual);
+        }
+    }
 }

@@ -44,7 +44,7 @@ fn geometric(mdp: &TabularMdp, reward: &[f64], likelihood: &[f64], discount: f64
     loop {
         iterations += 1;
         // E-step: β(s) = Σ_τ γ^τ β_τ(s), and through it β(s,a).
-        let resolvent = Resolvent::new(mdp, policy.probabilities(), discount);
+        let mut resolvent = Resolvent::new(mdp, policy.probabilities(), discount);
         let backward = resolvent.solve(&average(mdp, policy.probabilities(), likelihood));
         let backward_pairs = mdp.action_values(likelihood, discount, &backward);
         // M-step. Every state counts: one that the start cannot reach is planned for all the same.
@@ -54,7 +54,7 @@ fn geometric(mdp: &TabularMdp, reward: &[f64], likelihood: &[f64], discount: f64
         last = value.max(last);
         policy = improved;
         if converged || iterations == MAX_ITERATIONS {
-            let resolvent = Resolvent::new(mdp, policy.probabilities(), discount);
+            let mut resolvent = Resolvent::new(mdp, policy.probabilities(), discount);
             let state_values = resolvent.solve(&average(mdp, policy.probabilities(), reward));
             let action_values = mdp.action_values(reward, discount, &state_values);
             return Plan { state_values, action_values, policy, iterations, converged };

@@ -105,7 +105,7 @@ fn a_damaged_store_of_the_first_schema_is_repaired_into_the_newest() {
     let file = data.path().join("mazeway.sqlite3");
     let mut bytes = std::fs::read(sample(1)).expect("a sample");
     let victim = sampled(7, "");
-    let at = bytes.windows(victim.states.len()).position(|w| w == victim.states).expect("its states");
+    let at = bytes.windows(victim.rewards.len()).rposition(|w| w == victim.rewards).expect("its rewards");
     bytes[at] ^= 1;
     std::fs::write(&file, bytes).expect("a copy");
     let repair = store::repair(data.path()).expect("a repair");

@@ -117,13 +117,19 @@ pub fn checked(model: &Model) -> Result<TabularMdp, CliError> {
     })
 }
 
-/// The true reward and the optimal policy under it, where the model is exact and carries the style's reward.
+/// The true reward and the optimal policy under it, where the model is exact and carries the style's reward. Where the
+/// discount is 1 it is planned for the steps of the horizon.
 ///
 /// # Errors
 /// The planner refuses.
-pub fn truth(discount: f64, style: &str, model: &Model, mdp: &TabularMdp) -> Result<Option<Truth>, CliError> {
+pub fn truth(
+    (discount, horizon): (f64, Option<u32>),
+    style: &str,
+    model: &Model,
+    mdp: &TabularMdp,
+) -> Result<Option<Truth>, CliError> {
     let Some(reward) = model.reward(style).filter(|_| !model.estimated) else { return Ok(None) };
-    let options = PlanOptions { discount, ..PlanOptions::default() };
+    let options = PlanOptions { discount, horizon, ..PlanOptions::default() };
     let optimal = plan(PlannerKind::PolicyIteration, mdp, reward, &options).map_err(|error| {
         CliError::failure(format!("cannot plan under the true reward: {error}"), "try another --discount")
     })?;
@@ -160,13 +166,13 @@ impl Scene {
         env_id: &str,
         options: Options,
         style: Option<&str>,
-        discount: f64,
+        (discount, horizon): (f64, Option<u32>),
     ) -> Result<Self, CliError> {
         let spec = spec(environments, env_id).await?;
         let style = style.or(spec.styles.first().map(String::as_str)).unwrap_or_default().to_owned();
         let model = model(environments, &spec, &options).await?;
         let mdp = checked(&model)?;
-        let truth = truth(discount, &style, &model, &mdp)?;
+        let truth = truth((discount, horizon), &style, &model, &mdp)?;
         let expert = match &truth {
             Some(truth) => Expert::optimal(truth.optimal_policy.clone(), discount),
             None if spec.drivers.iter().any(|(name, _)| *name == style && name != "random") => Expert::driver(&style),

@@ -95,7 +95,7 @@ impl Job {
     /// # Errors
     /// Unknown methods, numbers out of range, malformed options, a layout that cannot be read: usage errors.
     pub fn new(args: &CompareArgs) -> Result<Self, CliError> {
-        args.learning.check()?;
+        args.learning.check(args.horizon)?;
         let horizon = args.horizon.unwrap_or(default_sizes(&args.env).1);
         let mut options = args.learning.options(0);
         options.horizon = Some(horizon);

@@ -85,8 +85,14 @@ pub async fn compare(
     narrator: Narrator,
     directory: impl FnOnce(&str) -> Result<PathBuf, CliError>,
 ) -> Result<(Comparison, PathBuf), CliError> {
-    let scene =
-        Scene::open(environments, &job.env_id, job.env_options.clone(), job.style.as_deref(), job.discount()).await?;
+    let scene = Scene::open(
+        environments,
+        &job.env_id,
+        job.env_options.clone(),
+        job.style.as_deref(),
+        (job.discount(), Some(job.horizon)),
+    )
+    .await?;
     let out = directory(&scene.style)?;
     narrator.step("model", super::fit::describe(&scene.model))?;
     let seeds = demonstrations(job, &scene, narrator).await?;

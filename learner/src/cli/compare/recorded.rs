@@ -55,7 +55,7 @@ async fn gather(
     let model = learner.model(&id).await?;
     narrator.step("model", models::describe(&model))?;
     let mdp = scene::checked(&model)?;
-    let truth = scene::truth(job.discount(), &style, &model, &mdp)?;
+    let truth = scene::truth((job.discount(), Some(job.horizon)), &style, &model, &mdp)?;
     let features = features_of(&model)?;
     let recordings = recordings(job, &style, &id, learner).await?;
     let most = job.trajectories.last().copied().unwrap_or(1) as usize;

@@ -59,7 +59,7 @@ pub async fn fit(
     say_unseen(&model, narrator)?;
 
     let mdp = scene::checked(&model)?;
-    let truth = scene::truth(job.discount(), &style, &model, &mdp)?;
+    let truth = scene::truth((job.discount(), job.horizon), &style, &model, &mdp)?;
     let recordings = find(job, &style, &model, learner).await?;
     let source =
         if recordings.filter.source.is_empty() { String::new() } else { format!(" by {}", recordings.filter.source) };

@@ -100,7 +100,7 @@ impl Job {
     /// An unknown method, numbers out of range, malformed options: all usage errors.
     pub fn new(args: &FitArgs) -> Result<Self, CliError> {
         let method = learning::method(&args.method, "--method")?;
-        args.learning.check()?;
+        args.learning.check(args.horizon)?;
         Ok(Self {
             env_id: args.env.clone(),
             env_options: args.env_options.iter().map(|text| env_option(text)).collect::<Result<_, _>>()?,

@@ -150,7 +150,7 @@ async fn transfer(
     let (job, learned) = (fitted.job, fitted.learned);
     let (target, told, driven) = target(plan_in, fitted, services).await?;
     let target_mdp = scene::checked(&target)?;
-    let truth = scene::truth(job.discount(), fitted.style, &target, &target_mdp)?;
+    let truth = scene::truth((job.discount(), job.horizon), fitted.style, &target, &target_mdp)?;
     let matching = Matching::new((fitted.mdp, &fitted.model.state_labels), (&target_mdp, &target.state_labels))
         .map_err(|error| {
             CliError::failure(error.to_string(), "plan in a model with the same actions and labelled states")

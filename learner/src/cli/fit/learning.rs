@@ -188,10 +188,11 @@ impl LearningArgs {
     ///
     /// # Errors
     /// Numbers out of range: usage errors.
-    pub fn check(&self) -> Result<(), CliError> {
-        if !(self.discount >= 0.0 && self.discount < 1.0) {
+    pub fn check(&self, horizon: Option<u32>) -> Result<(), CliError> {
+        let bounded = self.discount == 1.0 && horizon.is_some();
+        if !(bounded || self.discount >= 0.0 && self.discount < 1.0) {
             return Err(CliError::usage(
-                format!("expected --discount in [0, 1), got {}", self.discount),
+                format!("expected --discount in [0, 1), or 1 with a --horizon, got {}", self.discount),
                 "a discount close to 1, such as 0.99, looks far ahead",
             ));
         }

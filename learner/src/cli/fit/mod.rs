@@ -96,7 +96,7 @@ async fn fit(
     narrator.step("model", describe(&model))?;
 
     let mdp = scene::checked(&model)?;
-    let truth = scene::truth(job.discount(), &style, &model, &mdp)?;
+    let truth = scene::truth((job.discount(), job.horizon), &style, &model, &mdp)?;
     let expert = match &truth {
         Some(truth) => Some(Expert::optimal(truth.optimal_policy.clone(), job.discount())),
         None => spec.drivers.iter().any(|(name, _)| *name == style && name != "random").then(|| Expert::driver(&style)),

@@ -122,23 +122,41 @@ fn fill(matrix: &Matrix, order: &[u32], place: &[u32], bearable: u64) -> Option<
     Some(upper)
 }
 
+/// A number as factors keep it; all work on them is done in double precision.
+pub(super) trait Kept: Copy + Default + Into<f64> {
+    /// The nearest.
+    fn of(value: f64) -> Self;
+}
+
+impl Kept for f64 {
+    fn of(value: f64) -> Self {
+        value
+    }
+}
+
+impl Kept for f32 {
+    fn of(value: f64) -> Self {
+        value as Self
+    }
+}
+
 /// L (unit diagonal) and U of M in the order of a [`Symbolic`].
 #[derive(Clone)]
-pub(super) struct Factor {
+pub(super) struct Factor<V = f64> {
     symbolic: Symbolic,
-    upper: Vec<f64>,
-    lower: Vec<f64>,
+    upper: Vec<V>,
+    lower: Vec<V>,
     inverse_diagonal: Vec<f64>,
     work: Vec<f64>,
 }
 
-impl Factor {
+impl<V: Kept> Factor<V> {
     pub(super) fn new(symbolic: Symbolic) -> Self {
         let (n, fill) = (symbolic.order.len(), symbolic.upper.columns.len());
         Self {
             symbolic,
-            upper: vec![0.0; fill],
-            lower: vec![0.0; fill],
+            upper: vec![V::default(); fill],
+            lower: vec![V::default(); fill],
             inverse_diagonal: vec![0.0; n],
             work: vec![0.0; n],
         }
@@ -155,7 +173,7 @@ impl Factor {
             for at in symbolic.lower.range(row) {
                 let pivot = symbolic.lower.columns[at] as usize;
                 let multiplier = std::mem::take(&mut work[pivot]) * inverse_diagonal[pivot];
-                lower[at] = multiplier;
+                lower[at] = V::of(multiplier);
                 if multiplier != 0.0 {
                     let range = symbolic.upper.range(pivot);
                     subtract(work, multiplier, &symbolic.upper.columns[range.clone()], &upper[range]);
@@ -164,7 +182,7 @@ impl Factor {
             inverse_diagonal[row] = 1.0 / std::mem::take(&mut work[row]);
             let range = symbolic.upper.range(row);
             for (u, &column) in upper[range.clone()].iter_mut().zip(&symbolic.upper.columns[range]) {
-                *u = std::mem::take(&mut work[column as usize]);
+                *u = V::of(std::mem::take(&mut work[column as usize]));
             }
         }
     }
@@ -218,19 +236,19 @@ impl Factor {
 }
 
 /// y(columns) −= factor · values. Columns rise, so where they are consecutive a plain slice serves.
-fn subtract(y: &mut [f64], factor: f64, columns: &[u32], values: &[f64]) {
+fn subtract<V: Kept>(y: &mut [f64], factor: f64, columns: &[u32], values: &[V]) {
     let (Some(&first), Some(&last)) = (columns.first(), columns.last()) else { return };
     if (last - first) as usize + 1 == columns.len() {
         for (y, &v) in y[first as usize..=last as usize].iter_mut().zip(values) {
-            *y -= factor * v;
+            *y -= factor * v.into();
         }
     } else {
         for (&column, &v) in columns.iter().zip(values) {
-            y[column as usize] -= factor * v;
+            y[column as usize] -= factor * v.into();
         }
     }
 }
 
-fn product(y: &[f64], columns: &[u32], values: &[f64]) -> f64 {
-    columns.iter().zip(values).map(|(&column, &v)| v * y[column as usize]).sum()
+fn product<V: Kept>(y: &[f64], columns: &[u32], values: &[V]) -> f64 {
+    columns.iter().zip(values).map(|(&column, &v)| v.into() * y[column as usize]).sum()
 }

@@ -2,7 +2,7 @@
 //! 1977), which exists for every M-matrix and makes a splitting whose plain iteration converges too; or by the whole
 //! factorisation of an earlier policy.
 
-use super::direct::Factor;
+use super::direct::{Factor, Kept};
 use super::pattern::Matrix;
 use crate::mdp::numeric::{dot, max_abs, norm};
 
@@ -21,7 +21,7 @@ pub(super) trait Precondition {
     fn apply(&self, matrix: &Matrix, transposed: bool, y: &mut [f64]);
 }
 
-impl Precondition for Factor {
+impl<V: Kept> Precondition for Factor<V> {
     fn apply(&self, _matrix: &Matrix, transposed: bool, y: &mut [f64]) {
         let x = self.solve(y, transposed);
         y.copy_from_slice(&x);

@@ -33,6 +33,8 @@ const DIRECT_MULTIPLICATIONS: u64 = 50_000;
 /// … and so is one of this many times the entries of the matrix, for each decade that 1 − γ lies below 1 beyond the first:
 /// the passes of an iteration that it replaces.
 const DIRECT_PER_ENTRY: f64 = 100.0;
+/// Down to this 1 − γ, a hundred times the rounding of single precision, factors are kept in it.
+const SINGLE_PRECISION: f64 = 1e-5;
 /// Wanted residual, relative to the right-hand side.
 const RELATIVE_TOLERANCE: f64 = 1e-13;
 
@@ -54,7 +56,9 @@ pub(crate) struct Resolvent {
 
 enum Solver {
     Direct(Factor),
-    Iterative(Box<Iterative>),
+    Iterative(Box<Iterative<f32>>),
+    /// As [`Solver::Iterative`], where single precision would hide what tells M from a singular matrix.
+    IterativeInDouble(Box<Iterative<f64>>),
 }
 
 impl Resolvent {
@@ -73,7 +77,8 @@ impl Resolvent {
         let symbolic = if matrix.n_states() <= DIRECT_STATES { Symbolic::of(&matrix, bearable) } else { None };
         let solver = match symbolic {
             Some(symbolic) => Solver::Direct(Factor::new(symbolic)),
-            None => Solver::Iterative(Box::default()),
+            None if 1.0 - discount >= SINGLE_PRECISION => Solver::Iterative(Box::default()),
+            None => Solver::IterativeInDouble(Box::default()),
         };
         Self { discount, matrix, solver }
     }
@@ -84,6 +89,7 @@ impl Resolvent {
         match &mut self.solver {
             Solver::Direct(factor) => factor.factorise(&self.matrix),
             Solver::Iterative(iterative) => iterative.set_policy(&self.matrix),
+            Solver::IterativeInDouble(iterative) => iterative.set_policy(&self.matrix),
         }
     }
 
@@ -112,6 +118,7 @@ impl Resolvent {
         let x = match &mut self.solver {
             Solver::Direct(factor) => factor.solve(b, transposed),
             Solver::Iterative(iterative) => iterative.solve(&self.matrix, b, transposed, tolerance, start),
+            Solver::IterativeInDouble(iterative) => iterative.solve(&self.matrix, b, transposed, tolerance, start),
         };
         let residual = self.matrix.relative_residual(&x, b, transposed);
         Solution { x, residual }

@@ -84,7 +84,7 @@ proptest! {
         let (iterated, from_near) = (iterate(None), iterate(Some(&near)));
         let swept = incomplete.sweeps(&chosen.matrix, &b, transposed, near, RELATIVE_TOLERANCE, 20_000);
         // as if the model were large, after another policy, and with a factorisation that is forced early
-        let mut lasting = Iterative::default();
+        let mut lasting = Iterative::<f32>::default();
         let mut other = Matrix::of_model(&mdp);
         other.fill(&mdp, &vec![0.5; 2 * n], discount);
         lasting.set_policy(&other);

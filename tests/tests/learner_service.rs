@@ -464,7 +464,7 @@ async fn a_fit_without_what_it_needs_is_refused() {
     for (id, code) in [(nobody.as_str(), Code::NotFound), ("zz", Code::InvalidArgument)] {
         let error = learner.fit_trajectories(id).await.expect_err("no fit");
         assert_eq!(blame(&error), (code, "fit_id".into()));
-        let error = learner.export_fit_trajectories(id, &filter).await.err().expect("no fit");
+        let error = learner.export_fit_trajectories(id, &filter).await.expect_err("no fit");
         assert_eq!(blame(&error), (code, "fit_id".into()));
     }
 }

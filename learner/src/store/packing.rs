@@ -153,11 +153,10 @@ mod tests {
             kind in 0..4,
         ) {
             let rewards: Vec<f64> = steps.iter().map(|s| match kind {
-                0 => f64::from(s.3),
                 1 => f64::from(s.4),
                 2 if s.3 == 0 => -0.0,
-                2 => f64::from(s.3),
-                _ => s.2,
+                3 => s.2,
+                _ => f64::from(s.3),
             }).collect();
             let arrays = Arrays {
                 states: pack_u32(&steps.iter().map(|s| s.0 % n_states).collect::<Vec<_>>()),

@@ -55,7 +55,7 @@ pub(crate) struct Resolvent {
 }
 
 enum Solver {
-    Direct(Factor),
+    Direct(Box<Factor>),
     Iterative(Box<Iterative<f32>>),
     /// As [`Solver::Iterative`], where single precision would hide what tells M from a singular matrix.
     IterativeInDouble(Box<Iterative<f64>>),
@@ -76,7 +76,7 @@ impl Resolvent {
         let bearable = DIRECT_MULTIPLICATIONS.max((DIRECT_PER_ENTRY * decades * matrix.n_entries() as f64) as u64);
         let symbolic = if matrix.n_states() <= DIRECT_STATES { Symbolic::of(&matrix, bearable) } else { None };
         let solver = match symbolic {
-            Some(symbolic) => Solver::Direct(Factor::new(symbolic)),
+            Some(symbolic) => Solver::Direct(Box::new(Factor::new(symbolic))),
             None if 1.0 - discount >= SINGLE_PRECISION => Solver::Iterative(Box::default()),
             None => Solver::IterativeInDouble(Box::default()),
         };

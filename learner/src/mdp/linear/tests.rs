@@ -69,7 +69,7 @@ proptest! {
         let size = want.amax();
 
         let mut chosen = Resolvent::new(&mdp, &policy, discount);
-        let mut factor = Factor::new(Symbolic::of(&chosen.matrix, u64::MAX).expect("an order"));
+        let mut factor: Factor = Factor::new(Symbolic::of(&chosen.matrix, u64::MAX).expect("an order"));
         factor.factorise(&chosen.matrix);
         let mut incomplete = Incomplete::default();
         incomplete.factorise(&chosen.matrix);

@@ -110,6 +110,13 @@ pub(crate) fn is_broken(status: &Status) -> bool {
 
 impl From<Status> for ClientError {
     fn from(status: Status) -> Self {
+        // What a server says has no source; what has one happened to the connection, whatever code it was given.
+        if let Some(mut cause) = std::error::Error::source(&status).filter(|_| is_broken(&status)) {
+            while let Some(deeper) = cause.source() {
+                cause = deeper;
+            }
+            return Self::Status { code: Code::Unavailable, field: None, message: cause.to_string() };
+        }
         let details = status.get_error_details();
         let bad_request = details.bad_request().and_then(|d| d.field_violations.first()).map(|v| v.field.clone());
         let precondition =

@@ -4,6 +4,7 @@ use assert_cmd::Command;
 use mazeway_client::{Learner, Recorder};
 use mazeway_proto::learner as pb;
 use mazeway_tests::{
+    authority::Authority,
     learner::trajectory,
     programs::{Service, program},
 };
@@ -234,4 +235,49 @@ fn a_service_that_is_told_to_stop_ends_well() {
     assert!(child.wait().expect("an end").success());
     // The log is folded into the database.
     assert!(!data.path().join("mazeway.sqlite3-wal").exists());
+}
+
+#[tokio::test]
+async fn a_running_learner_is_reached_over_tls_with_a_token() {
+    let (authority, data) = (Authority::new(), tempfile::tempdir().expect("a directory"));
+    let tokens = authority.path("tokens");
+    let mut make = learner(&["token", "me", "--scopes", "act,record,fit,admin", "--append"]);
+    make.arg(&tokens);
+    let secret = said(make).trim().to_owned();
+    let (cert, key) = authority.sign("a service");
+    let mut serve = std::process::Command::new(program("learner"));
+    serve.args(["serve", "--listen", "127.0.0.1:0", "--tokens"]).arg(&tokens);
+    serve
+        .arg("--tls-cert")
+        .arg(authority.file("cert.pem", &cert))
+        .arg("--tls-key")
+        .arg(authority.file("key.pem", &key));
+    serve.arg("--data").arg(data.path());
+    let service = Service::start(serve);
+    let address = format!("https://{}", service.address());
+    let (token, ca) = (authority.file("token", &format!("{secret}\n")), authority.root_file());
+    let list = |arguments: &[&str]| learner(&[&["list", "--json", "--addr", &address], arguments].concat());
+
+    let mut known = list(&["--token-file"]);
+    known.arg(&token).arg("--tls-ca").arg(&ca);
+    said(known);
+    let mut known = list(&[]);
+    known.env("MAZEWAY_TOKEN", &secret).env("MAZEWAY_TLS_CA", &ca);
+    said(known);
+    // Without the token, without the authority, with files that are none.
+    let mut unknown = list(&["--tls-ca"]);
+    unknown.arg(&ca);
+    let (_, hint) = refused(unknown, 1);
+    assert!(hint.contains("--token-file"), "{hint}");
+    let mut strange = list(&["--token-file"]);
+    strange.arg(&token);
+    let (error, _) = refused(strange, 1);
+    assert!(!error.contains(&secret), "{error}");
+    let (error, hint) = refused(list(&["--token-file", "/nowhere/token"]), 2);
+    assert!(error.contains("/nowhere/token") && hint.contains("--token-file"), "{error}; {hint}");
+    // A token in the clear leaves the machine only by request.
+    let mut clear = learner(&["list", "--addr", "robots.example:50052", "--token-file"]);
+    clear.arg(&token);
+    let (error, hint) = refused(clear, 2);
+    assert!(error.contains("https://") && hint.contains("--token-in-clear"), "{error}; {hint}");
 }

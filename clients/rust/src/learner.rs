@@ -224,37 +224,6 @@ impl Learner {
         }
     }
 
-    /// One page of the ids of the trajectories that a fit used, in the order used; `token` is empty for the first, then the
-    /// `next_page_token` of the page before.
-    ///
-    /// # Errors
-    /// No such fit, or several; a malformed size or token.
-    pub async fn fit_trajectories_page(
-        &self,
-        fit_id: &str,
-        page_size: u32,
-        token: &str,
-    ) -> Result<pb::ListFitTrajectoriesResponse, ClientError> {
-        let request = pb::ListFitTrajectoriesRequest { fit_id: fit_id.into(), page_size, page_token: token.to_owned() };
-        Ok(self.service.clone().list_fit_trajectories(request).await?.into_inner())
-    }
-
-    /// Ids of the trajectories that a fit used, in the order used, all of them.
-    ///
-    /// # Errors
-    /// No such fit, or several.
-    pub async fn fit_trajectories(&self, fit_id: &str) -> Result<Vec<String>, ClientError> {
-        let (mut all, mut token) = (Vec::new(), String::new());
-        loop {
-            let page = self.fit_trajectories_page(fit_id, TRAJECTORY_PAGE, &token).await?;
-            all.extend(page.trajectory_ids);
-            if page.next_page_token.is_empty() {
-                return Ok(all);
-            }
-            token = page.next_page_token;
-        }
-    }
-
     /// Fits and returns the stored fit; calls `progress` now and then, at most about ten times a second. Dropping the
     /// future cancels the fit.
     ///

@@ -22,7 +22,7 @@ pub fn rule(path: &str) -> Rule {
             "GetModel" => Rule::stream(MODELS),
             "ListModels" => Rule::call(MODELS),
             "ExportTrajectories" | "Fit" => Rule::stream(FIT),
-            "ListTrajectories" | "GetFit" | "ListFits" => Rule::call(FIT),
+            "ListTrajectories" | "ListFitTrajectories" | "GetFit" | "ListFits" => Rule::call(FIT),
             _ => Rule::call(ADMIN),
         },
         _ => Rule::call(Need::Token),

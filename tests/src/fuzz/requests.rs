@@ -288,7 +288,7 @@ pub fn learner_seeds() -> Vec<Vec<u8>> {
         (3, pb::ListModelsRequest { env_id: "Test-v0".into() }.encode_to_vec()),
         (4, pb::ListTrajectoriesRequest { filter: filter(), page_size: 3, ..Default::default() }.encode_to_vec()),
         (5, pb::DeleteTrajectoriesRequest { filter: filter() }.encode_to_vec()),
-        (6, pb::ExportTrajectoriesRequest { filter: filter() }.encode_to_vec()),
+        (6, pb::ExportTrajectoriesRequest { filter: filter(), ..Default::default() }.encode_to_vec()),
         (7, pb::FitRequest { filter: filter(), method: "bc".into(), ..Default::default() }.encode_to_vec()),
         (8, pb::GetFitRequest { fit_id: "0123abcd".into() }.encode_to_vec()),
         (9, pb::ListFitsRequest { page_size: 5, ..Default::default() }.encode_to_vec()),

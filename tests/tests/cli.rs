@@ -71,7 +71,7 @@ fn wrong_usage_is_one_error_and_one_hint() {
         (&["show"], "the following required arguments were not provided: <ID>", "see 'learner show --help'"),
         (&["show", "x"], "expected an id or its first 8 or more characters, got 'x'", "learner list"),
         (&["delete"], "expected what to delete, got no condition", "--style"),
-        (&["serve", "--listen", "here"], "invalid value 'here' for '--listen <HOST:PORT>'", "'learner serve --help'"),
+        (&["serve", "--listen", "here"], "invalid value 'here' for '--listen <ADDR>'", "'learner serve --help'"),
         (&["serve", "--listen", "0.0.0.0:0"], "0.0.0.0:0 is reached from other machines", "--insecure"),
         (&["export", "--format", "xml"], "invalid value 'xml' for '--format <FORMAT>'", "'learner export --help'"),
     ];

@@ -37,7 +37,12 @@ async fn record_until_death(address: String, first: u128, acknowledged: Arc<Atom
         }
     });
     let stream = tokio_stream::wrappers::ReceiverStream::new(stream);
-    let mut answers = service.record_trajectories(stream).await.expect("a stream").into_inner();
+    // The service may die before this stream has begun: then nothing of it was acknowledged.
+    let Ok(answers) = service.record_trajectories(stream).await else {
+        sender.abort();
+        return Vec::new();
+    };
+    let mut answers = answers.into_inner();
     let mut safe = Vec::new();
     while let Ok(Some(answer)) = answers.message().await {
         let begin = first + (safe.len() as u128);

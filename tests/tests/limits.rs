@@ -123,9 +123,16 @@ async fn a_stream_that_nobody_reads_ends_and_its_neighbour_goes_on() {
 async fn calls_given_up_without_end_close_their_connection() {
     let server = server(DoorConfig { max_resets_per_second: 50, ..DoorConfig::default() });
     let (mut hostile, mut neighbour) = (service(&server).await, service(&server).await);
-    let open = async |service: &mut Service| service.interact(tokio_stream::pending()).await.map(Response::into_inner);
-    let mut of_hostile = open(&mut hostile).await.expect("a stream");
-    let mut of_neighbour = open(&mut neighbour).await.expect("a stream");
+    let session = pb::CreateSessionRequest { env_id: "Maze-v0".into(), ..Default::default() };
+    let session_id = neighbour.create_session(session).await.expect("a session").into_inner().session_id;
+    // A call whose request is whole: dropping its answer resets it.
+    let open = async |service: &mut Service| {
+        let request = pb::WatchRequest { session_id: session_id.clone(), ..Default::default() };
+        service.watch(request).await.map(Response::into_inner)
+    };
+    let pending = tokio_stream::pending;
+    let mut of_hostile = hostile.interact(pending()).await.expect("a stream").into_inner();
+    let mut of_neighbour = neighbour.interact(pending()).await.expect("a stream").into_inner();
     // As many as a client may need.
     for _ in 0..30 {
         drop(open(&mut neighbour).await.expect("a stream"));

@@ -209,3 +209,13 @@ async fn run(command: Command, settings: &Settings) -> Result<(), CliError> {
         Command::Token(args) => serve::token(&args),
     }
 }
+
+/// Bytes as a digest is written.
+fn hexadecimal(bytes: &[u8]) -> String {
+    use std::fmt::Write as _;
+    bytes.iter().fold(String::with_capacity(64), |mut text, byte| {
+        // Writing to a string cannot fail.
+        let _ = write!(text, "{byte:02x}");
+        text
+    })
+}

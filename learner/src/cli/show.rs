@@ -5,6 +5,7 @@ use super::{
     connect::connect,
     error::CliError,
     export::known,
+    hexadecimal,
     list::stopped,
     models,
     table::{facts, table, time},
@@ -182,10 +183,6 @@ fn fit_json(fit: &pb::Fit, names: &(Names, Names)) -> Result<Value, CliError> {
         "state_visits": array(&fit.state_visits, s, "the state visits")?,
         "trace": trace.collect::<Vec<_>>(),
     }))
-}
-
-fn hexadecimal(bytes: &[u8]) -> String {
-    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
 /// Intervals of the weights; null where the method has none.

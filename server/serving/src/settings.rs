@@ -3,7 +3,7 @@
 //!
 //! Whatever is a flag of a command is also a variable, which is a prefix and the flag's name in capitals, and a key of the
 //! file, which is the flag's name. The file is checked by the flags' own parsers and then taken for their defaults, so that
-//! no value can mean one thing here and another there. Invariant: what [`effective`] writes is such a file, and says again
+//! no value can mean one thing here and another there. Invariant: what [`Settings::effective`] writes is such a file, and says again
 //! what it said.
 
 use clap::{Arg, ArgAction, ArgMatches, Command, builder::FalseyValueParser, parser::ValueSource};

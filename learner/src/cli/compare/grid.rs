@@ -4,7 +4,7 @@
 //! itself (a method that works in parallel does so on that one), so that times can be compared and no core waits for another.
 
 use super::job::{Entry, Job};
-use crate::cli::fit::assemble::Truth;
+use crate::cli::{fit::assemble::Truth, hexadecimal};
 use mazeway_client::Model;
 use mazeway_learner::{
     eval::{
@@ -18,7 +18,6 @@ use mazeway_learner::{
 };
 use sha2::{Digest as _, Sha256};
 use std::{
-    fmt::Write as _,
     ops::ControlFlow,
     sync::{
         atomic::{AtomicBool, AtomicUsize, Ordering},
@@ -276,12 +275,4 @@ fn absorb(hash: &mut Sha256, trajectories: &[Trajectory]) {
         }
         hash.update(trajectory.final_state().unwrap_or(u32::MAX).to_le_bytes());
     }
-}
-
-fn hexadecimal(bytes: &[u8]) -> String {
-    bytes.iter().fold(String::with_capacity(64), |mut text, byte| {
-        // Writing to a string cannot fail.
-        let _ = write!(text, "{byte:02x}");
-        text
-    })
 }

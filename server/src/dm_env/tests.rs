@@ -21,9 +21,7 @@ use std::sync::Arc;
 use tokio_util::sync::CancellationToken;
 
 fn process() -> Process {
-    let telemetry = mazeway_serving::Telemetry::new("test");
-    let config = Config { max_total_envs: 64, ..Config::default() };
-    let host = Host::new(config, &telemetry, CancellationToken::new());
+    let host = Host::new(Config { max_total_envs: 64, ..Config::default() }, CancellationToken::new());
     Process::new(Arc::new(host), mazeway_serving::Caller::anybody())
 }
 

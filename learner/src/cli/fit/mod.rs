@@ -161,10 +161,8 @@ async fn learn(
     };
     let spinner = narrator.spinner("fit");
     let fit = services
-        .fit(request, |event| {
-            if let Some(message) = narrate::fit_event(event) {
-                spinner.set_message(message);
-            }
+        .fit(request, |progress| {
+            spinner.set_message(format!("iteration {}, objective {:.6}", progress.iteration, progress.objective));
         })
         .await?;
     spinner.finish_and_clear();

@@ -160,12 +160,14 @@ pub(super) fn walk(
     let whole = found.structure.is_empty();
 
     let names = if whole { HashMap::new() } else { names(&snapshot) };
-    // An id is no part of what is hashed: of two rows that have the same one, the index tells whose it is.
+    // An id is no part of what is hashed: where the row and the index do not agree on whose it is, nobody knows.
     let owners: HashMap<&str, i64> = names.iter().map(|(&key, id)| (id.as_str(), key)).collect();
     let mut seen = HashSet::new();
     let mut another = |key: i64, recording: &Recording| {
-        let owner = owners.get(recording.id().to_string().as_str());
-        !whole && (owner.is_some_and(|&owner| owner != key) || !seen.insert(recording.id()))
+        let id = recording.id().to_string();
+        let (owner, indexed) = (owners.get(id.as_str()), names.get(&key));
+        let elsewhere = owner.is_some_and(|&owner| owner != key) || indexed.is_some_and(|indexed| *indexed != id);
+        !whole && (elsewhere || !seen.insert(recording.id()))
     };
     let mut collections = HashMap::new();
     let keys = Keys::new(&snapshot, "trajectories", "seq", &["trajectories_by_collection"], whole);
@@ -173,7 +175,13 @@ pub(super) fn walk(
         let name = || names.get(&key).cloned().unwrap_or_else(|| format!("row {key}"));
         match trajectory(&snapshot, path, found.schema, &mut collections, key) {
             Ok(Some((_, recording))) if another(key, &recording) => {
-                found.count(Kind::Trajectory, Err((name(), damaged("trajectory", "its id is that of another one"))));
+                found.count(
+                    Kind::Trajectory,
+                    Err((
+                        name(),
+                        damaged("trajectory", "its id is that of another one, or another than the index has"),
+                    )),
+                );
             }
             Ok(Some((recorded_at_us, recording))) => {
                 visit(Sound::Trajectory { seq: key, recorded_at_us, recording: &recording })?;

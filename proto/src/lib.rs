@@ -7,6 +7,8 @@
 #![forbid(unsafe_code)]
 #![allow(clippy::all, clippy::pedantic, reason = "generated code")]
 
+pub mod raw;
+
 /// Package `mazeway`.
 pub mod mazeway {
     /// Package `mazeway.env`.

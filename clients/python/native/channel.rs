@@ -4,8 +4,9 @@ use crate::{
     driver::{Driver, Keeper, Local},
     errors::Failure,
 };
-use bytes::{Buf as _, BufMut as _, Bytes};
+use bytes::Bytes;
 use mazeway_client::{ClientCertificate, ConnectOptions, Connection, Token, Wire};
+use mazeway_proto::raw::Raw;
 use pyo3::{exceptions::PyValueError, prelude::*, types::PyBytes};
 use std::{
     mem,
@@ -17,53 +18,10 @@ use tokio::{
     task::JoinHandle,
 };
 use tokio_stream::wrappers::UnboundedReceiverStream;
-use tonic::{
-    Request, Status, Streaming,
-    client::Grpc,
-    codec::{Codec, DecodeBuf, Decoder, EncodeBuf, Encoder},
-    codegen::http::uri::PathAndQuery,
-};
+use tonic::{Request, Status, Streaming, client::Grpc, codegen::http::uri::PathAndQuery};
 
 /// Largest message either way.
 const MAX_MESSAGE_BYTES: usize = 256 << 20;
-
-/// Messages as they are.
-#[derive(Debug, Clone, Copy, Default)]
-struct Raw;
-
-impl Codec for Raw {
-    type Encode = Bytes;
-    type Decode = Bytes;
-    type Encoder = Self;
-    type Decoder = Self;
-
-    fn encoder(&mut self) -> Self {
-        Self
-    }
-
-    fn decoder(&mut self) -> Self {
-        Self
-    }
-}
-
-impl Encoder for Raw {
-    type Item = Bytes;
-    type Error = Status;
-
-    fn encode(&mut self, item: Bytes, out: &mut EncodeBuf<'_>) -> Result<(), Status> {
-        out.put(item);
-        Ok(())
-    }
-}
-
-impl Decoder for Raw {
-    type Item = Bytes;
-    type Error = Status;
-
-    fn decode(&mut self, message: &mut DecodeBuf<'_>) -> Result<Option<Bytes>, Status> {
-        Ok(Some(message.copy_to_bytes(message.remaining())))
-    }
-}
 
 /// A connection and who drives it.
 #[derive(Debug)]

@@ -3,8 +3,9 @@
 
 use super::process::process;
 use crate::grpc::host::Host;
-use bytes::{Buf as _, BufMut as _, Bytes};
+use bytes::Bytes;
 use futures_util::StreamExt as _;
+use mazeway_proto::raw::Raw;
 use mazeway_serving::Caller;
 use std::{
     convert::Infallible,
@@ -15,7 +16,6 @@ use std::{
 use tonic::{
     Request, Response, Status, Streaming,
     body::Body as Reply,
-    codec::{Codec, DecodeBuf, Decoder, EncodeBuf, Encoder},
     codegen::{Body, BoxFuture, Service, StdError, http, tokio_stream::Stream},
     server::{Grpc, NamedService, StreamingService},
 };
@@ -56,7 +56,7 @@ where
         let config = &self.0.config;
         let actions = config.max_envs_per_session.saturating_mul(BYTES_AN_ACTION).saturating_add(4096);
         let largest_request = MAX_REQUEST_BYTES.max(actions).min(config.max_message_bytes);
-        let mut grpc = Grpc::new(Frames)
+        let mut grpc = Grpc::new(Raw)
             .max_decoding_message_size(largest_request)
             // Observations are within the limit; their frame comes on top.
             .max_encoding_message_size(config.max_message_bytes.saturating_add(4096));
@@ -75,42 +75,5 @@ impl StreamingService<Bytes> for Process {
         let caller = Caller::of(&request);
         let answers = process(Arc::clone(&self.0), caller, request.into_inner()).boxed();
         Box::pin(std::future::ready(Ok(Response::new(answers))))
-    }
-}
-
-/// Messages as the bytes that they are.
-struct Frames;
-
-impl Codec for Frames {
-    type Encode = Bytes;
-    type Decode = Bytes;
-    type Encoder = Self;
-    type Decoder = Self;
-
-    fn encoder(&mut self) -> Self {
-        Self
-    }
-
-    fn decoder(&mut self) -> Self {
-        Self
-    }
-}
-
-impl Encoder for Frames {
-    type Item = Bytes;
-    type Error = Status;
-
-    fn encode(&mut self, frame: Bytes, buffer: &mut EncodeBuf<'_>) -> Result<(), Status> {
-        buffer.put(frame);
-        Ok(())
-    }
-}
-
-impl Decoder for Frames {
-    type Item = Bytes;
-    type Error = Status;
-
-    fn decode(&mut self, buffer: &mut DecodeBuf<'_>) -> Result<Option<Bytes>, Status> {
-        Ok(Some(buffer.copy_to_bytes(buffer.remaining())))
     }
 }

@@ -5,25 +5,20 @@
 //! after what makes it sensible: a reset before a step, a world joined before anything is done in it.
 
 use crate::{EnvServer, config, learner::LearnerServer, learner::trajectory};
-use bytes::{Buf as _, BufMut as _, Bytes};
+use bytes::Bytes;
 use mazeway_client::packed::pack;
 use mazeway_learner::config::Limits;
 use mazeway_proto::{
     dm_env::{self, environment_request::Payload},
     env::{self, interact_request},
     learner as pb,
+    raw::Raw,
 };
 use mazeway_server::Config;
 use prost::Message;
 use std::{cell::RefCell, path::Path, time::Duration};
 use tokio::{runtime::Runtime, time::timeout};
-use tonic::{
-    Code, Request, Status,
-    client::Grpc,
-    codec::{Codec, DecodeBuf, Decoder, EncodeBuf, Encoder},
-    codegen::http::uri::PathAndQuery,
-    transport::Channel,
-};
+use tonic::{Code, Request, Status, client::Grpc, codegen::http::uri::PathAndQuery, transport::Channel};
 
 /// Stands in inputs for the id of the session and the name of the world that are there.
 const SESSION: &[u8; 32] = b"session-session-session-session-";
@@ -208,7 +203,7 @@ const ENVIRONMENT_METHODS: [(&str, &str); 9] = [
     (WORLDS, ""),
 ];
 
-const LEARNER_METHODS: [(&str, &str); 10] = [
+const LEARNER_METHODS: [(&str, &str); 11] = [
     (LEARNER, "RecordTrajectories"),
     (LEARNER, "PutModel"),
     (LEARNER, "GetModel"),
@@ -219,6 +214,7 @@ const LEARNER_METHODS: [(&str, &str); 10] = [
     (LEARNER, "Fit"),
     (LEARNER, "GetFit"),
     (LEARNER, "ListFits"),
+    (LEARNER, "ListFitTrajectories"),
 ];
 
 /// A request to the environment server.
@@ -293,41 +289,4 @@ pub fn learner_seeds() -> Vec<Vec<u8>> {
         (8, pb::GetFitRequest { fit_id: "0123abcd".into() }.encode_to_vec()),
         (9, pb::ListFitsRequest { page_size: 5, ..Default::default() }.encode_to_vec()),
     ])
-}
-
-/// Messages as the bytes that they are.
-struct Raw;
-
-impl Codec for Raw {
-    type Encode = Bytes;
-    type Decode = Bytes;
-    type Encoder = Self;
-    type Decoder = Self;
-
-    fn encoder(&mut self) -> Self {
-        Self
-    }
-
-    fn decoder(&mut self) -> Self {
-        Self
-    }
-}
-
-impl Encoder for Raw {
-    type Item = Bytes;
-    type Error = Status;
-
-    fn encode(&mut self, message: Bytes, buffer: &mut EncodeBuf<'_>) -> Result<(), Status> {
-        buffer.put(message);
-        Ok(())
-    }
-}
-
-impl Decoder for Raw {
-    type Item = Bytes;
-    type Error = Status;
-
-    fn decode(&mut self, buffer: &mut DecodeBuf<'_>) -> Result<Option<Bytes>, Status> {
-        Ok(Some(buffer.copy_to_bytes(buffer.remaining())))
-    }
 }

@@ -1,6 +1,7 @@
 //! What Mazeway's wire is compared with: plain sockets, and bare gRPC that carries as many bytes.
 
 use crate::process::Process;
+use mazeway_proto::raw::Raw as Plain;
 use std::{
     io::{Read, Write},
     net::{TcpListener, TcpStream},
@@ -14,7 +15,6 @@ use tokio_stream::{StreamExt as _, wrappers::ReceiverStream};
 use tonic::{
     Request, Response, Status, Streaming,
     body::Body,
-    codec::{Codec, DecodeBuf, Decoder, EncodeBuf, Encoder},
     codegen::{BoxFuture, BoxStream, Bytes, Context, Poll, Service, http},
     server::{Grpc, NamedService, StreamingService, UnaryService},
     transport::{Channel, Endpoint, Server, server::TcpIncoming},
@@ -135,45 +135,6 @@ impl<S: Read + Write> Raw<S> {
     pub fn round_trip(&mut self) {
         self.stream.write_all(&self.request).expect("sends");
         self.stream.read_exact(&mut self.reply).expect("receives");
-    }
-}
-
-/// Messages as they are.
-#[derive(Clone, Copy, Default)]
-struct Plain;
-
-impl Codec for Plain {
-    type Encode = Bytes;
-    type Decode = Bytes;
-    type Encoder = Self;
-    type Decoder = Self;
-
-    fn encoder(&mut self) -> Self {
-        Self
-    }
-
-    fn decoder(&mut self) -> Self {
-        Self
-    }
-}
-
-impl Encoder for Plain {
-    type Item = Bytes;
-    type Error = Status;
-
-    fn encode(&mut self, item: Bytes, dst: &mut EncodeBuf<'_>) -> Result<(), Status> {
-        bytes::BufMut::put_slice(dst, &item);
-        Ok(())
-    }
-}
-
-impl Decoder for Plain {
-    type Item = Bytes;
-    type Error = Status;
-
-    fn decode(&mut self, src: &mut DecodeBuf<'_>) -> Result<Option<Bytes>, Status> {
-        let len = bytes::Buf::remaining(src);
-        Ok(Some(bytes::Buf::copy_to_bytes(src, len)))
     }
 }
 

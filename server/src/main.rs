@@ -1,8 +1,8 @@
 //! The environment server's binary.
 
-use clap::{CommandFactory as _, FromArgMatches as _};
+use clap::CommandFactory as _;
 use mazeway_server::{
-    ListenAddress, Listener,
+    Listener,
     config::{Cli, Command, PLACES, Settings, VARIABLES},
     serve,
 };
@@ -16,7 +16,7 @@ use tracing_subscriber::EnvFilter;
 
 fn main() -> ExitCode {
     let parsed = settings::parse(Cli::command(), VARIABLES, &PLACES, env::args_os());
-    let (cli, settings) = match parsed.and_then(|settings| Ok((from_matches(&settings)?, settings))) {
+    let (cli, settings) = match parsed.and_then(|settings| Ok((settings.typed::<Cli>()?, settings))) {
         Ok(parsed) => parsed,
         Err(SettingsError::Usage(error)) if !error.use_stderr() => {
             // Help and version; a closed pipe while printing them is nobody's failure.
@@ -56,10 +56,6 @@ fn main() -> ExitCode {
     runtime.block_on(run(cli))
 }
 
-fn from_matches(settings: &settings::Settings) -> Result<Cli, SettingsError> {
-    Cli::from_arg_matches(&settings.matches).map_err(|error| SettingsError::Usage(Box::new(error)))
-}
-
 /// Writes what was asked for. A closed pipe is not a failure: the reader has seen enough.
 fn print(text: &str) -> ExitCode {
     match io::stdout().write_all(text.as_bytes()).and_then(|()| io::stdout().flush()) {
@@ -74,11 +70,7 @@ async fn run(cli: Settings) -> ExitCode {
     let listener = match Listener::bind(&cli.listen).await {
         Ok(listener) => listener,
         Err(error) => {
-            let hint = match cli.listen {
-                ListenAddress::Tcp(_) => "take a free port: --listen 127.0.0.1:0",
-                ListenAddress::Unix(_) => "take a short path that is free, in a directory of yours",
-            };
-            return refuse(1, &format!("cannot listen on {}: {error}", cli.listen), hint);
+            return refuse(1, &format!("cannot listen on {}: {error}", cli.listen), cli.listen.otherwise());
         }
     };
     // Before anyone is told that the server is there, and may tell it to stop.

@@ -19,7 +19,7 @@ mod serve;
 mod show;
 mod table;
 
-use clap::{Args, CommandFactory as _, FromArgMatches as _, Parser, Subcommand};
+use clap::{Args, CommandFactory as _, Parser, Subcommand};
 use directories::ProjectDirs;
 use error::CliError;
 use mazeway_client::{ClientError, ConnectFiles, ConnectOptions};
@@ -160,7 +160,7 @@ pub fn data_directory(asked: Option<PathBuf>) -> Result<PathBuf, CliError> {
 /// Parses the arguments, runs the command and says how it went.
 pub fn main() -> ExitCode {
     let parsed = settings::parse(Cli::command(), serve::VARIABLES, &serve::PLACES, std::env::args_os());
-    let (cli, settings) = match parsed.and_then(|settings| Ok((from_matches(&settings)?, settings))) {
+    let (cli, settings) = match parsed.and_then(|settings| Ok((settings.typed::<Cli>()?, settings))) {
         Ok(parsed) => parsed,
         Err(SettingsError::Usage(error)) => return error::report_usage(&error),
         Err(error) => return CliError::usage(error.to_string(), "see what there is with 'learner config'").report(),
@@ -184,10 +184,6 @@ pub fn main() -> ExitCode {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => error.report(),
     }
-}
-
-fn from_matches(settings: &Settings) -> Result<Cli, SettingsError> {
-    Cli::from_arg_matches(&settings.matches).map_err(|error| SettingsError::Usage(Box::new(error)))
 }
 
 async fn run(command: Command, settings: &Settings) -> Result<(), CliError> {

@@ -59,13 +59,8 @@ pub async fn run(args: ServeArgs) -> Result<(), CliError> {
     let data = data_directory(data)?;
     // A directory that cannot be used is said before the address is: who reads the line may connect.
     drop(Store::open(&data)?);
-    let cannot = |error: std::io::Error| {
-        let hint = match &listen {
-            ListenAddress::Tcp(_) => "take a free port: --listen 127.0.0.1:0",
-            ListenAddress::Unix(_) => "take a short path that is free, in a directory of yours",
-        };
-        CliError::failure(format!("cannot listen on {listen}: {error}"), hint)
-    };
+    let cannot =
+        |error: std::io::Error| CliError::failure(format!("cannot listen on {listen}: {error}"), listen.otherwise());
     let no_signals =
         |error| CliError::failure(format!("cannot watch for signals: {error}"), "raise the limit on open files");
     let stopped = stop_signal().map_err(no_signals)?;

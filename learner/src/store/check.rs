@@ -161,20 +161,18 @@ pub(super) fn walk(
 
     let names = if whole { HashMap::new() } else { names(&snapshot) };
     // An id is no part of what is hashed: where the row and the index do not agree on whose it is, nobody knows.
-    let owners: HashMap<&str, i64> = names.iter().map(|(&key, id)| (id.as_str(), key)).collect();
+    let owners: HashMap<Uuid, i64> = names.iter().map(|(&key, &id)| (id, key)).collect();
     let mut seen = HashSet::new();
-    let mut another = |key: i64, recording: &Recording| {
-        let id = recording.id().to_string();
-        let (owner, indexed) = (owners.get(id.as_str()), names.get(&key));
-        let elsewhere = owner.is_some_and(|&owner| owner != key) || indexed.is_some_and(|indexed| *indexed != id);
-        !whole && (elsewhere || !seen.insert(recording.id()))
+    let mut another = |key: i64, id: Uuid| {
+        let elsewhere = owners.get(&id).is_some_and(|owner| *owner != key);
+        !whole && (elsewhere || names.get(&key).is_some_and(|indexed| *indexed != id) || !seen.insert(id))
     };
     let mut collections = HashMap::new();
     let keys = Keys::new(&snapshot, "trajectories", "seq", &["trajectories_by_collection"], whole);
     keys.try_for_each(|key, known| {
-        let name = || names.get(&key).cloned().unwrap_or_else(|| format!("row {key}"));
+        let name = || names.get(&key).map_or_else(|| format!("row {key}"), Uuid::to_string);
         match trajectory(&snapshot, path, found.schema, &mut collections, key) {
-            Ok(Some((_, recording))) if another(key, &recording) => {
+            Ok(Some((_, recording))) if another(key, recording.id()) => {
                 found.count(
                     Kind::Trajectory,
                     Err((
@@ -277,7 +275,7 @@ impl Keys {
 }
 
 /// Ids of trajectories by row, as far as the index of the ids reads.
-fn names(connection: &Connection) -> HashMap<i64, String> {
+fn names(connection: &Connection) -> HashMap<i64, Uuid> {
     let mut names = HashMap::new();
     let sql = "SELECT seq, trajectory_id FROM trajectories INDEXED BY sqlite_autoindex_trajectories_1";
     let Ok(mut statement) = connection.prepare(sql) else { return names };
@@ -285,7 +283,7 @@ fn names(connection: &Connection) -> HashMap<i64, String> {
     while let Ok(Some(row)) = rows.next() {
         let id = row.get_ref(1).ok().and_then(|id| stored_uuid(id).ok());
         if let (Ok(seq), Some(id)) = (row.get(0), id) {
-            names.insert(seq, id.to_string());
+            names.insert(seq, id);
         }
     }
     names

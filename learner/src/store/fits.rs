@@ -106,16 +106,17 @@ pub(super) fn find(connection: &Connection, path: &Path, prefix: &str) -> Result
 /// Reads the one fit whose id begins so.
 pub(super) fn get(connection: &Connection, path: &Path, prefix: &str) -> Result<Option<pb::Fit>, StoreError> {
     match find(connection, path, prefix)? {
-        Some((row, id)) => read(connection, path, row, &id).map(Some),
+        Some((row, id)) => {
+            let document = stored(connection, row).map_err(|e| StoreError::from_sqlite(path, &e))?;
+            decode(&document).map(Some).map_err(|message| corrupt(&id, message))
+        }
         None => Ok(None),
     }
 }
 
-fn read(connection: &Connection, path: &Path, row: i64, id: &str) -> Result<pb::Fit, StoreError> {
-    let document: Vec<u8> = connection
-        .query_row("SELECT document FROM fits WHERE seq = ?", [row], |row| row.get(0))
-        .map_err(|e| StoreError::from_sqlite(path, &e))?;
-    decode(&document).map_err(|message| corrupt(id, message))
+/// The document of a row.
+fn stored(connection: &Connection, row: i64) -> rusqlite::Result<Vec<u8>> {
+    connection.query_row("SELECT document FROM fits WHERE seq = ?", [row], |row| row.get(0))
 }
 
 /// A document of any version.
@@ -154,7 +155,7 @@ pub(super) fn unfold_all(connection: &Connection) -> rusqlite::Result<()> {
 
 /// As [`unfold_all`], of one row.
 pub(super) fn unfold(connection: &Connection, row: i64) -> rusqlite::Result<()> {
-    let old: Vec<u8> = connection.query_row("SELECT document FROM fits WHERE seq = ?", [row], |row| row.get(0))?;
+    let old = stored(connection, row)?;
     let (Ok(fit), Ok(Some(ids))) = (decode(&old), old_ids(&old)) else { return Ok(()) };
     for (page, ids) in ids.chunks(IDS_A_PAGE).enumerate() {
         let ids = ids.iter().flat_map(|id| *id.as_bytes()).collect::<Vec<u8>>();
@@ -169,12 +170,11 @@ pub(super) fn by_row(connection: &Connection, path: &Path, seq: i64) -> Result<O
     let fail = |e: rusqlite::Error| StoreError::from_sqlite(path, &e);
     let found = connection.query_row("SELECT fit_id FROM fits WHERE seq = ?", [seq], |row| row.get::<_, String>(0));
     let Some(fit_id) = found.optional().map_err(fail)? else { return Ok(None) };
-    let fit = read(connection, path, seq, &fit_id)?;
+    let document = stored(connection, seq).map_err(fail)?;
+    let fit = decode(&document).map_err(|message| corrupt(&fit_id, message))?;
     if fit.fit_id != fit_id {
         return Err(corrupt(&fit_id, "its document is that of another fit"));
     }
-    let document: Vec<u8> =
-        connection.query_row("SELECT document FROM fits WHERE seq = ?", [seq], |row| row.get(0)).map_err(fail)?;
     if document.first() == Some(&DOCUMENT_VERSION) {
         let mut tally = Tally::default();
         let sql = "SELECT page, ids FROM fit_trajectories WHERE fit = ? ORDER BY page";

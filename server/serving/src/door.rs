@@ -263,8 +263,6 @@ impl http_body::Body for Answer {
                     Err(frame) => Ok(frame),
                 }));
             }
-            // An answer that says so because its request was given up is none.
-            Poll::Ready(Some(Ok(ref frame))) if gives_up(frame) => {}
             Poll::Ready(_) => this.call.completes(),
         }
         polled
@@ -278,13 +276,6 @@ impl http_body::Body for Answer {
         // Of the body alone: without the rest it would be wrong.
         if self.rest.is_empty() { self.body.size_hint() } else { SizeHint::default() }
     }
-}
-
-/// Whether the trailers tell that the peer gave the call up: that is how a reset arrives at what reads its request.
-fn gives_up(frame: &Frame<Bytes>) -> bool {
-    let cancelled = tonic::Code::Cancelled as i32;
-    let status = frame.trailers_ref().and_then(|trailers| trailers.get("grpc-status"));
-    status.is_some_and(|status| status.as_bytes() == cancelled.to_string().as_bytes())
 }
 
 impl Answer {

@@ -26,6 +26,14 @@ impl ListenAddress {
             Self::Unix(_) => true,
         }
     }
+
+    /// What to do where nobody can listen there.
+    pub fn otherwise(&self) -> &'static str {
+        match self {
+            Self::Tcp(_) => "take a free port: --listen 127.0.0.1:0",
+            Self::Unix(_) => "take a short path that is free, in a directory of yours",
+        }
+    }
 }
 
 impl From<SocketAddr> for ListenAddress {

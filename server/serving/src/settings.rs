@@ -6,7 +6,7 @@
 //! no value can mean one thing here and another there. Invariant: what [`Settings::effective`] writes is such a file, and says again
 //! what it said.
 
-use clap::{Arg, ArgAction, ArgMatches, Command, builder::FalseyValueParser, parser::ValueSource};
+use clap::{Arg, ArgAction, ArgMatches, Command, FromArgMatches, builder::FalseyValueParser, parser::ValueSource};
 use std::{
     collections::BTreeMap,
     ffi::OsString,
@@ -201,6 +201,14 @@ fn check(command: &Command, arg: &Arg, long: &str, value: &str) -> Result<(), St
 }
 
 impl Settings {
+    /// The command line as a type.
+    ///
+    /// # Errors
+    /// A value that the type does not take.
+    pub fn typed<T: FromArgMatches>(&self) -> Result<T, SettingsError> {
+        T::from_arg_matches(&self.matches).map_err(|error| SettingsError::Usage(Box::new(error)))
+    }
+
     /// The flags of the service.
     pub fn flags(&self) -> &ArgMatches {
         match self.matches.subcommand() {

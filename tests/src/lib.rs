@@ -2,6 +2,7 @@
 
 pub mod authority;
 pub mod crash;
+pub mod desk;
 pub mod faces;
 pub mod fuzz;
 pub mod learner;

@@ -1,7 +1,6 @@
 //! `learner import` and back: models and demonstrations from files, through the real binary into the real store.
 
-use assert_cmd::Command;
-use mazeway_tests::programs::program;
+use mazeway_tests::desk::{learner, object, refused, said};
 use serde_json::Value;
 use std::{
     fs,
@@ -15,40 +14,6 @@ fn examples() -> PathBuf {
 
 fn example(name: &str) -> String {
     examples().join(name).to_str().expect("a path in UTF-8").to_owned()
-}
-
-/// The binary over a data directory, in the directory itself, so that files in it are named without their path.
-fn learner(data: &TempDir, arguments: &[&str]) -> Command {
-    let mut command = Command::new(program("learner"));
-    for (name, _) in std::env::vars().filter(|(name, _)| name.starts_with("MAZEWAY_") || name == "RUST_LOG") {
-        command.env_remove(name);
-    }
-    command.current_dir(data.path()).args(arguments).args(["--data", "store"]);
-    command
-}
-
-fn said(data: &TempDir, arguments: &[&str]) -> String {
-    let output = learner(data, arguments).output().expect("a process");
-    let complaint = String::from_utf8_lossy(&output.stderr);
-    assert!(output.status.success() && complaint.is_empty(), "{arguments:?}: {complaint}");
-    String::from_utf8(output.stdout).expect("text")
-}
-
-fn object(data: &TempDir, arguments: &[&str]) -> Value {
-    let text = said(data, &[arguments, &["--json"]].concat());
-    serde_json::from_str(&text).unwrap_or_else(|error| panic!("{error}: {text}"))
-}
-
-/// Runs and expects a refusal: nothing on standard output, one `error:` line and one `hint:` line on standard error.
-fn refused(data: &TempDir, arguments: &[&str], code: i32) -> String {
-    let output = learner(data, arguments).output().expect("a process");
-    let said = String::from_utf8(output.stderr).expect("text");
-    assert_eq!(output.status.code(), Some(code), "{arguments:?}: {said}");
-    assert!(output.stdout.is_empty(), "{arguments:?}");
-    let lines = said.lines().collect::<Vec<_>>();
-    let [error, hint] = lines[..] else { panic!("expected two lines, got {said:?}") };
-    assert!(hint.starts_with("hint: ") && hint.len() > 10, "{said:?}");
-    error.strip_prefix("error: ").unwrap_or_else(|| panic!("expected an error, got {said:?}")).to_owned()
 }
 
 fn directory() -> TempDir {

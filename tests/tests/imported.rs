@@ -1,45 +1,10 @@
 //! What can be done with an imported environment beside a plain fit: methods compared on users' recordings and features, the
 //! learned reward planned on in another imported model, a finite horizon without discount, and the data of a fit exported.
 
-use mazeway_tests::programs::program;
+use mazeway_tests::desk::{failed, object, said};
 use serde_json::{Value, json};
-use std::{
-    fs,
-    path::Path,
-    process::{Command, Output},
-};
+use std::{fs, path::Path};
 use tempfile::TempDir;
-
-fn run(data: &TempDir, arguments: &[&str]) -> Output {
-    let mut command = Command::new(program("learner"));
-    for (name, _) in std::env::vars().filter(|(name, _)| name.starts_with("MAZEWAY_") || name == "RUST_LOG") {
-        command.env_remove(name);
-    }
-    command.current_dir(data.path()).args(arguments).args(["--data", "store"]).output().expect("a process")
-}
-
-fn said(data: &TempDir, arguments: &[&str]) -> String {
-    let output = run(data, arguments);
-    let complaint = String::from_utf8_lossy(&output.stderr);
-    assert!(output.status.success() && complaint.is_empty(), "{arguments:?}: {complaint}");
-    String::from_utf8(output.stdout).expect("text")
-}
-
-fn object(data: &TempDir, arguments: &[&str]) -> Value {
-    let text = said(data, &[arguments, &["--json"]].concat());
-    serde_json::from_str(&text).unwrap_or_else(|error| panic!("{error}: {text}"))
-}
-
-/// The `error:` line of a refusal, which has a `hint:` line too.
-fn refused(data: &TempDir, arguments: &[&str], code: i32) -> String {
-    let output = run(data, arguments);
-    let said = String::from_utf8(output.stderr).expect("text");
-    assert_eq!(output.status.code(), Some(code), "{arguments:?}: {said}");
-    let lines = said.lines().collect::<Vec<_>>();
-    let [error, hint] = lines[..] else { panic!("expected two lines, got {said:?}") };
-    assert!(hint.starts_with("hint: ") && hint.len() > 10, "{said:?}");
-    error.strip_prefix("error: ").unwrap_or_else(|| panic!("expected an error, got {said:?}")).to_owned()
-}
 
 /// The example of the documentation: its model and its three walks.
 fn commute() -> (TempDir, Value) {
@@ -77,11 +42,11 @@ fn methods_are_compared_on_recordings_and_features_of_ones_own() {
     assert_eq!(object(&data, &asked).as_array().expect("an array"), rows);
 
     let more = ["compare", "--env", "Commute", "--methods", "bc", "--out", "out", "--trajectories"];
-    let error = refused(&data, &[&more[..], &["3"]].concat(), 1);
+    let error = failed(&data, &[&more[..], &["3"]].concat(), 1);
     assert!(error.contains("more than 3 recordings of style 'stroller'") && error.ends_with("got 3"), "{error}");
-    let error = refused(&data, &[&more[..], &["1", "--env-option", "slip=0.1"]].concat(), 2);
+    let error = failed(&data, &[&more[..], &["1", "--env-option", "slip=0.1"]].concat(), 2);
     assert!(error.contains("no server simulates Commute"), "{error}");
-    let error = refused(&data, &["compare", "--env", "Nowhere", "--out", "out"], 2);
+    let error = failed(&data, &["compare", "--env", "Nowhere", "--out", "out"], 2);
     assert!(error.contains("unknown environment 'Nowhere'"), "{error}");
 }
 
@@ -105,7 +70,7 @@ fn a_learned_reward_is_planned_on_in_another_imported_model() {
     assert!(names[0].contains("planned on anew") && names[3] == "the optimal policy there", "{names:?}");
     let lost = |row: &Value| row["expected_value_difference"].as_f64().expect("a number");
     assert!(rows.iter().all(|row| lost(row) >= -1e-12) && lost(&rows[3]).abs() < 1e-9, "{rows:?}");
-    let error = refused(&data, &[&fit[..], &["0123456789ab"]].concat(), 1);
+    let error = failed(&data, &[&fit[..], &["0123456789ab"]].concat(), 1);
     assert!(error.contains("0123456789ab"), "{error}");
     // One with other actions cannot be planned in.
     model["actions"] = json!(["walk", "tram"]);
@@ -119,7 +84,7 @@ fn a_learned_reward_is_planned_on_in_another_imported_model() {
     fs::write(data.path().join("other.json"), model.to_string()).expect("a file");
     let other = object(&data, &["import", "--model", "other.json", "--env", "Other"]);
     let id = other["model"]["id"].as_str().expect("an id");
-    refused(&data, &[&fit[..], &[id]].concat(), 1);
+    failed(&data, &[&fit[..], &[id]].concat(), 1);
 }
 
 #[test]
@@ -132,9 +97,9 @@ fn without_discount_a_horizon_is_planned_for() {
     assert!(agreement.as_f64().is_some_and(|share| (0.0..=1.0).contains(&share)), "{report}");
     assert!(lost.as_f64().is_some_and(|lost| lost >= -1e-12), "what is lost in four steps: {report}");
     // Five steps were not recorded, and without a horizon nothing is bounded.
-    let error = refused(&data, &[&fit[..], &["--horizon", "5"]].concat(), 1);
+    let error = failed(&data, &[&fit[..], &["--horizon", "5"]].concat(), 1);
     assert!(error.contains("nothing is recorded for Commute") || error.contains("recordings"), "{error}");
-    refused(&data, &[&fit[..], &["--method", "mce"]].concat(), 2);
+    failed(&data, &[&fit[..], &["--method", "mce"]].concat(), 2);
 }
 
 #[test]
@@ -155,7 +120,7 @@ fn what_a_fit_used_is_exported() {
     let gone = first["id"].as_str().expect("an id");
     said(&data, &["delete", "--id", gone, "--yes"]);
     assert_eq!(said(&data, &["export", "--fit", &id[..8]]).lines().count(), 1);
-    let error = refused(&data, &["export", "--fit", "00000000-0000-0000-0000-000000000000"], 1);
+    let error = failed(&data, &["export", "--fit", "00000000-0000-0000-0000-000000000000"], 1);
     assert!(error.contains("there is no fit"), "{error}");
-    refused(&data, &["export", "--fit", "xyz"], 2);
+    failed(&data, &["export", "--fit", "xyz"], 2);
 }

@@ -38,6 +38,23 @@ def hidden(arguments: dict[str, Any]) -> dict[str, Any]:
     return arguments if token is None else {**arguments, "token": Secret(token)}
 
 
+class DiscreetSpec:
+    """An environment whose `spec`, which shows its arguments, shows no token."""
+
+    _spec: Any = None
+
+    @property
+    def spec(self) -> Any:
+        """What `gymnasium.make` or `gymnasium.make_vec` was given."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: Any) -> None:
+        if spec is not None and spec.kwargs.get("token") is not None:
+            spec.kwargs = hidden(spec.kwargs)
+        self._spec = spec
+
+
 @dataclass(frozen=True)
 class Access:
     """What goes along with an address."""

@@ -46,6 +46,7 @@ REPEATABLE = frozenset(
         "GetFit",
         "GetModel",
         "ListEnvironments",
+        "ListFitTrajectories",
         "ListFits",
         "ListModels",
         "ListTrajectories",

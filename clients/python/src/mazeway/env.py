@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mazeway import _arrays
-from mazeway._access import Access, hidden
+from mazeway._access import Access, DiscreetSpec
 from mazeway._session import DEFAULT_ADDRESS, DEFAULT_TIMEOUT_SECS, Session
 from mazeway.errors import InvalidArgumentError
 
@@ -50,7 +50,7 @@ def refuse_options(options: dict[str, Any] | None) -> None:
         )
 
 
-class MazewayEnv(gymnasium.Env[Any, Any]):
+class MazewayEnv(DiscreetSpec, gymnasium.Env[Any, Any]):
     """One environment that runs on a Mazeway server.
 
     Made by `gymnasium.make("mazeway/Maze-v0", address="127.0.0.1:50051")`, which also adds Gymnasium's
@@ -69,8 +69,6 @@ class MazewayEnv(gymnasium.Env[Any, Any]):
         "render_modes": ["ansi", "rgb_array"],
         "render_fps": 5,
     }
-
-    _spec: Any = None
 
     def __init__(
         self,
@@ -132,18 +130,6 @@ class MazewayEnv(gymnasium.Env[Any, Any]):
         )
         self._observation_space: gymnasium.Space[Any] | None = None
         self._action_space: gymnasium.spaces.Discrete | None = None
-
-    @property
-    def spec(self) -> Any:
-        """What `gymnasium.make` was given."""
-        return self._spec
-
-    @spec.setter
-    def spec(self, spec: Any) -> None:
-        # It shows its arguments, and a token is shown to nobody.
-        if spec is not None and spec.kwargs.get("token") is not None:
-            spec.kwargs = hidden(spec.kwargs)
-        self._spec = spec
 
     @property
     def observation_space(self) -> gymnasium.Space[Any]:  # type: ignore[override]

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from gymnasium.vector.utils import batch_space
 
 from mazeway import _arrays
-from mazeway._access import Access, hidden
+from mazeway._access import Access, DiscreetSpec
 from mazeway._link import First, Stepped
 from mazeway._session import DEFAULT_ADDRESS, DEFAULT_TIMEOUT_SECS, Session
 from mazeway.env import MazewayEnv, action_space, check_seed, refuse_options, render, server_env_id
@@ -34,7 +34,7 @@ except ImportError:  # Gymnasium 1.0 knows the first mode only and has no name f
 Flags = npt.NDArray[np.bool_]
 
 
-class MazewayVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
+class MazewayVectorEnv(DiscreetSpec, gymnasium.vector.VectorEnv[Any, Any, Any]):
     """A batch of environments that runs on a Mazeway server, stepped with one message.
 
     Made by `gymnasium.make_vec("mazeway/Maze-v0", num_envs=64, address="127.0.0.1:50051")`. Behaves as a
@@ -46,8 +46,6 @@ class MazewayVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         **MazewayEnv.metadata,
         "autoreset_mode": AutoresetMode.NEXT_STEP,
     }
-
-    _spec: Any = None
 
     def __init__(
         self,
@@ -190,18 +188,6 @@ class MazewayVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             gymnasium.logger.warn("render() was called without a render mode")
             return None
         return tuple(render(self._session, i, self.render_mode) for i in range(self.num_envs))
-
-    @property
-    def spec(self) -> Any:
-        """What `gymnasium.make_vec` was given."""
-        return self._spec
-
-    @spec.setter
-    def spec(self, spec: Any) -> None:
-        # It shows its arguments, and a token is shown to nobody.
-        if spec is not None and spec.kwargs.get("token") is not None:
-            spec.kwargs = hidden(spec.kwargs)
-        self._spec = spec
 
     @property
     def session_id(self) -> str:

@@ -50,8 +50,8 @@ pub struct Limits {
     /// Fits that run at a time; further ones wait their turn
     #[arg(long, default_value_t = 2, value_name = "N")]
     pub max_concurrent_fits: usize,
-    /// Fits that wait their turn
-    #[arg(long, default_value_t = 64, value_name = "N")]
+    /// Fits that wait their turn; callers with tokens take turns, and none of them takes all places
+    #[arg(long, default_value_t = 256, value_name = "N")]
     pub max_queued_fits: usize,
     /// Iterations that a fit may ask for
     #[arg(long, default_value_t = 1_000_000, value_name = "N")]
@@ -79,7 +79,7 @@ impl Default for Limits {
             max_model_rows: 4_000_000,
             max_model_transitions: 20_000_000,
             max_concurrent_fits: 2,
-            max_queued_fits: 64,
+            max_queued_fits: 256,
             max_fit_iterations: 1_000_000,
             max_streams_per_connection: 256,
             keepalive: Duration::from_secs(10),

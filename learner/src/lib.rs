@@ -23,4 +23,4 @@ pub mod transitions;
 #[cfg(feature = "service")]
 pub use config::Config;
 #[cfg(feature = "service")]
-pub use grpc::{CallError, ServeError, fit_options, serve, stopped};
+pub use grpc::{CallError, ServeError, fit_options, serve, serve_observed, stopped, telemetry, yield_to_others};

@@ -1,8 +1,7 @@
 //! Settings of a server: limits and times, each a flag, a variable and a key of the binary's file of settings.
 
 use crate::sessions::Limits;
-use mazeway_serving::token_command::TokenArgs;
-use mazeway_serving::{DoorConfig, ListenAddress, config::seconds};
+use mazeway_serving::{DoorConfig, ListenAddress, TelemetryConfig, config::seconds, token_command::TokenArgs};
 use std::{path::PathBuf, time::Duration};
 
 /// Everything that a server can be told. [`Config::default`] has the defaults of the flags.
@@ -151,6 +150,9 @@ pub struct Settings {
     /// Limits and times.
     #[command(flatten)]
     pub limits: Config,
+    /// What is shown.
+    #[command(flatten)]
+    pub telemetry: TelemetryConfig,
 }
 
 #[cfg(test)]

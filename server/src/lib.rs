@@ -19,6 +19,6 @@ pub mod sim;
 #[cfg(feature = "grpc")]
 pub use config::Config;
 #[cfg(feature = "grpc")]
-pub use grpc::{CallError, ServeError, serve};
+pub use grpc::{CallError, ServeError, serve, serve_observed, telemetry};
 #[cfg(feature = "grpc")]
 pub use mazeway_serving::{DoorConfig, ListenAddress, Listener};

@@ -4,15 +4,18 @@ use clap::CommandFactory as _;
 use mazeway_server::{
     Listener,
     config::{Cli, Command, PLACES, Settings, VARIABLES},
-    serve,
+    serve_observed,
 };
-use mazeway_serving::settings::{self, SettingsError};
+use mazeway_serving::{
+    settings::{self, SettingsError},
+    telemetry::{endpoint, logs},
+};
 use std::{
     env,
     io::{self, Write as _},
     process::ExitCode,
+    sync::Arc,
 };
-use tracing_subscriber::EnvFilter;
 
 fn main() -> ExitCode {
     let parsed = settings::parse(Cli::command(), VARIABLES, &PLACES, env::args_os());
@@ -40,13 +43,16 @@ fn main() -> ExitCode {
             };
         }
     };
-    let filter = EnvFilter::try_from_env("MAZEWAY_LOG").unwrap_or_else(|_| EnvFilter::new("warn"));
-    tracing_subscriber::fmt().with_env_filter(filter).with_writer(io::stderr).init();
     if let Err((error, hint)) = cli.limits.door.check_exposed(&cli.listen, cli.insecure) {
         return refuse(2, &error, hint);
     }
     if let Err(error) = cli.limits.door.check() {
         return refuse(2, &error.to_string(), "see SECURITY.md for how such files are made");
+    }
+    if !cli.telemetry.is_local() && !cli.insecure {
+        let error =
+            "the numbers of --metrics-listen would be reached from other machines, and nobody is asked who they are";
+        return refuse(2, error, "listen on 127.0.0.1, or add --insecure where the network is trusted");
     }
     // Connections are served by threads of their own: this one takes them in.
     let runtime = match tokio::runtime::Builder::new_current_thread().enable_all().build() {
@@ -67,11 +73,32 @@ fn print(text: &str) -> ExitCode {
 }
 
 async fn run(cli: Settings) -> ExitCode {
+    let spans = match logs::start(&cli.telemetry, "mazeway-server") {
+        Ok(spans) => spans,
+        Err(error) => return refuse(2, &format!("no spans can be exported: {error}"), "see 'server --help'"),
+    };
+    let code = observed(cli).await;
+    spans.flush().await;
+    code
+}
+
+async fn observed(cli: Settings) -> ExitCode {
     let listener = match Listener::bind(&cli.listen).await {
         Ok(listener) => listener,
         Err(error) => {
             return refuse(1, &format!("cannot listen on {}: {error}", cli.listen), cli.listen.otherwise());
         }
+    };
+    let telemetry = Arc::new(mazeway_server::telemetry());
+    let shown = match cli.telemetry.metrics_listen {
+        None => None,
+        Some(address) => match endpoint::start(address, Arc::clone(&telemetry)).await {
+            Ok(shown) => Some(shown),
+            Err(error) => {
+                let hint = "take a free port: --metrics-listen 127.0.0.1:0";
+                return refuse(1, &format!("cannot show numbers on {address}: {error}"), hint);
+            }
+        },
     };
     // Before anyone is told that the server is there, and may tell it to stop.
     let stop = match stop_signal() {
@@ -81,9 +108,13 @@ async fn run(cli: Settings) -> ExitCode {
     let address = listener.address().unwrap_or(cli.listen);
     // Whoever started this may have closed the other end; the server serves all the same.
     let _ = writeln!(io::stdout(), "listening on {address}").and_then(|()| io::stdout().flush());
-    match serve(cli.limits, listener, stop).await {
+    if let Some(shown) = &shown {
+        let _ =
+            writeln!(io::stdout(), "metrics on http://{}/metrics", shown.address()).and_then(|()| io::stdout().flush());
+    }
+    match serve_observed(cli.limits, listener, telemetry, stop).await {
         Ok(()) => ExitCode::SUCCESS,
-        Err(error) => refuse(1, &error.to_string(), "set MAZEWAY_LOG=info to see more"),
+        Err(error) => refuse(1, &error.to_string(), "add --log info to see more"),
     }
 }
 

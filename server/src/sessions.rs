@@ -142,10 +142,20 @@ struct Slot {
 /// Lets others reach the owner of a taken session; whatever the adapter needs.
 pub type OwnerHandle = Arc<dyn std::any::Any + Send + Sync>;
 
+/// How many sessions there have been.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Tally {
+    /// Made.
+    pub created: u64,
+    /// Ended by their leases.
+    pub expired: u64,
+}
+
 #[derive(Default)]
 struct Inner {
     slots: HashMap<SessionId, Slot>,
     total_envs: usize,
+    tally: Tally,
     /// Sessions and environments of each holder that has any.
     held: HashMap<Arc<str>, (usize, usize)>,
     expired: VecDeque<(SessionId, Arc<str>)>,
@@ -168,6 +178,7 @@ impl Inner {
 
     fn expire(&mut self, id: SessionId) {
         let Some(holder) = self.remove(id) else { return };
+        self.tally.expired += 1;
         if self.expired.len() == REMEMBERED_IDS {
             self.expired.pop_front();
         }
@@ -216,6 +227,16 @@ impl Sessions {
     /// Number of sessions.
     pub fn len(&self) -> usize {
         self.lock().slots.len()
+    }
+
+    /// Number of environments of all sessions.
+    pub fn total_envs(&self) -> usize {
+        self.lock().total_envs
+    }
+
+    /// How many sessions there have been.
+    pub fn tally(&self) -> Tally {
+        self.lock().tally
     }
 
     /// True while the session lives, its lease run out or not.
@@ -271,6 +292,7 @@ impl Sessions {
                 limit("num_envs", "environments of this caller", max, envs.saturating_add(num_envs))?;
             }
             inner.total_envs += num_envs;
+            inner.tally.created += 1;
             inner.held.insert(Arc::clone(&holder.name), (sessions + 1, envs + num_envs));
             let (sight, holder, expires) = (Arc::default(), Arc::clone(&holder.name), now + lease);
             let slot = Slot { batch: None, owner: None, sight, render_fps: 1, holder, num_envs, lease, expires };

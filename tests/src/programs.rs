@@ -8,6 +8,22 @@ use std::{
     sync::OnceLock,
 };
 
+/// Cargo, as if called from a shell: it sets variables for a test that build scripts of dependencies look at, and would
+/// build them, and all that stands on them, again and again.
+pub fn cargo() -> Command {
+    let mut cargo = Command::new(env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
+    for (name, _) in env::vars_os() {
+        let of_package = |name: &str| {
+            name == "CARGO_CRATE_NAME"
+                || ["CARGO_PKG_", "CARGO_MANIFEST_", "CARGO_BIN_"].iter().any(|start| name.starts_with(start))
+        };
+        if name.to_str().is_some_and(of_package) {
+            cargo.env_remove(name);
+        }
+    }
+    cargo
+}
+
 /// The path of `server` or `learner`.
 ///
 /// # Panics
@@ -18,7 +34,7 @@ pub fn program(name: &str) -> PathBuf {
         let own = env::current_exe().expect("a path of this test");
         let profile = own.ancestors().nth(2).and_then(Path::file_name).expect("a profile's directory");
         let profile = if profile == "debug" { "dev" } else { profile.to_str().expect("a name in UTF-8") };
-        let mut cargo = Command::new(env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
+        let mut cargo = cargo();
         cargo.args(["build", "--quiet", "--workspace", "--bin", "server", "--bin", "learner", "--profile", profile]);
         // With a test among the targets, dependencies have the features that they have in `cargo test --workspace`: what
         // that has built need not be built again.

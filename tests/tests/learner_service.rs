@@ -493,13 +493,8 @@ fn everywhere(n_states: u32, n_actions: u32) -> Vec<ModelPart> {
     parts
 }
 
-#[tokio::test(flavor = "multi_thread")]
-async fn a_fit_ends_when_its_caller_goes_and_the_next_one_begins() {
-    let data = tempfile::tempdir().expect("a directory");
-    let limits = Limits { max_concurrent_fits: 1, max_queued_fits: 1, ..Limits::default() };
-    let server = LearnerServer::with(data.path(), limits);
-    let (learner, _) = with_demonstrations(&server).await;
-    let filter = |style: &str| Some(pb::TrajectoryFilter { style: style.into(), ..Default::default() });
+/// A fit that would run for minutes, and what it works on in the store.
+async fn endless(learner: &Learner) -> pb::FitRequest {
     // Every iteration solves for 500 states that all lead everywhere, and without a penalty the likelihood of what was
     // never seen has no maximum: it would run for minutes.
     let model = everywhere(500, 4);
@@ -517,9 +512,9 @@ async fn a_fit_ends_when_its_caller_goes_and_the_next_one_begins() {
     };
     recorder.record(demonstration).await.expect("a demonstration");
     recorder.finish().await.expect("stored");
-    let endless = pb::FitRequest {
+    pb::FitRequest {
         method: "em-tied".into(),
-        filter: filter("wandering"),
+        filter: Some(pb::TrajectoryFilter { style: "wandering".into(), ..Default::default() }),
         options: Some(pb::FitOptions {
             basis: pb::Basis::StateAction as i32,
             penalty: pb::Penalty::None as i32,
@@ -528,7 +523,17 @@ async fn a_fit_ends_when_its_caller_goes_and_the_next_one_begins() {
             ..Default::default()
         }),
         ..Default::default()
-    };
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_fit_ends_when_its_caller_goes_and_the_next_one_begins() {
+    let data = tempfile::tempdir().expect("a directory");
+    let limits = Limits { max_concurrent_fits: 1, max_queued_fits: 1, ..Limits::default() };
+    let server = LearnerServer::with(data.path(), limits);
+    let (learner, _) = with_demonstrations(&server).await;
+    let filter = |style: &str| Some(pb::TrajectoryFilter { style: style.into(), ..Default::default() });
+    let endless = endless(&learner).await;
     let quick = pb::FitRequest { method: "bc".into(), filter: filter("goals"), ..Default::default() };
     let mut running = learner.fit_stream(endless.clone()).await.expect("a stream");
     let first = timeout(PATIENCE, running.next()).await.expect("progress").expect("progress");
@@ -537,20 +542,75 @@ async fn a_fit_ends_when_its_caller_goes_and_the_next_one_begins() {
     let mut waiting = learner.fit_stream(quick.clone()).await.expect("a place in the queue");
     let error = learner.fit_stream(quick.clone()).await.expect_err("a full queue");
     assert_eq!(error.code(), Code::ResourceExhausted);
+    let place = timeout(PATIENCE, waiting.next()).await.expect("a place").expect("a place");
+    assert_eq!(place, Some(Event::Queued(pb::FitQueued { place: 1, length: 1 })));
     assert!(timeout(Duration::from_millis(300), waiting.next()).await.is_err(), "it waits its turn");
     drop(running);
     let fit = loop {
         match timeout(PATIENCE, waiting.next()).await.expect("its turn").expect("a fit") {
             Some(Event::Fit(fit)) => break fit,
-            Some(Event::Progress(_)) => {}
+            Some(Event::Progress(_) | Event::Queued(_)) => {}
             None => panic!("the stream of a fit ended without a fit"),
         }
     };
     // The place is free again.
-    learner.fit(quick, |_| ()).await.expect("a fit");
+    learner.fit(quick.clone(), |_| ()).await.expect("a fit");
     let stored = learner.list_fits("", "").await.expect("fits");
     assert!(stored.iter().any(|f| f.fit_id == fit.fit_id));
     assert!(stored.iter().all(|f| f.method == "bc"), "the fit whose caller went is not stored");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_hundred_fits_wait_their_turn_and_nothing_else_does() {
+    let data = tempfile::tempdir().expect("a directory");
+    let server = LearnerServer::with(data.path(), Limits { max_concurrent_fits: 1, ..Limits::default() });
+    let (learner, _) = with_demonstrations(&server).await;
+    let endless = endless(&learner).await;
+    let quick = pb::FitRequest {
+        method: "bc".into(),
+        filter: Some(pb::TrajectoryFilter { style: "goals".into(), ..Default::default() }),
+        ..Default::default()
+    };
+    let mut running = learner.fit_stream(endless).await.expect("a stream");
+    timeout(PATIENCE, running.next()).await.expect("it runs").expect("progress");
+    let mut waiting = Vec::new();
+    for length in 1..=100 {
+        let mut stream = learner.fit_stream(quick.clone()).await.expect("a place in the queue");
+        let place = timeout(PATIENCE, stream.next()).await.expect("a place").expect("a place");
+        assert_eq!(place, Some(Event::Queued(pb::FitQueued { place: length, length })));
+        waiting.push(stream);
+    }
+    // One in the middle goes: the last moves up.
+    drop(waiting.remove(50));
+    let mut last = waiting.pop().expect("the last");
+    let moved = async {
+        loop {
+            if let Some(Event::Queued(pb::FitQueued { place: 99, length: 99 })) = last.next().await.expect("a place") {
+                return;
+            }
+        }
+    };
+    timeout(PATIENCE, moved).await.expect("its new place");
+    // All threads of fits are taken: recording and reading go on.
+    for number in 0..50 {
+        let mut recorder = learner.recorder();
+        recorder.record(trajectory(number)).await.expect("a trajectory");
+        let receipt = timeout(PATIENCE, recorder.finish()).await.expect("no wait for a fit").expect("stored");
+        assert_eq!(receipt.stored, 1);
+    }
+    assert!(learner.list_fits("", "").await.expect("fits").is_empty());
+    drop(running);
+    waiting.push(last);
+    for mut stream in waiting {
+        loop {
+            match timeout(PATIENCE, stream.next()).await.expect("its turn").expect("a fit") {
+                Some(Event::Fit(_)) => break,
+                Some(_) => {}
+                None => panic!("the stream of a fit ended without a fit"),
+            }
+        }
+    }
+    assert_eq!(learner.list_fits("", "").await.expect("fits").len(), 99);
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -234,11 +234,28 @@ impl Learner {
         request: pb::FitRequest,
         mut progress: impl FnMut(&pb::FitProgress),
     ) -> Result<pb::Fit, ClientError> {
+        let follow = |event: &Event| {
+            if let Event::Progress(entry) = event {
+                progress(entry);
+            }
+        };
+        self.fit_following(request, follow).await
+    }
+
+    /// As [`Learner::fit`]; calls `follow` with all that happens before the fit is there, its places in the queue among it.
+    ///
+    /// # Errors
+    /// Nothing to fit on, an unknown model, wrong options.
+    pub async fn fit_following(
+        &self,
+        request: pb::FitRequest,
+        mut follow: impl FnMut(&Event),
+    ) -> Result<pb::Fit, ClientError> {
         let mut stream = self.fit_stream(request).await?;
         loop {
             match stream.next().await? {
-                Some(Event::Progress(entry)) => progress(&entry),
                 Some(Event::Fit(fit)) => return Ok(fit),
+                Some(event) => follow(&event),
                 None => return Err(ClientError::protocol("the stream of a fit ended without a fit")),
             }
         }

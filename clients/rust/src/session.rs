@@ -166,9 +166,18 @@ impl Session {
             // Where it ended with answers to come, the last of these says why.
             Sent::Ended if awaited > 0 => Ok(()),
             Sent::Ended => {
-                self.open = None;
-                Err(ClientError::Interrupted { request: ask.name(), message: "the stream ended".into() })
+                let message = self.last_words().await;
+                Err(ClientError::Interrupted { request: ask.name(), message })
             }
+        }
+    }
+
+    /// Why the stream has ended that takes no more requests, as the server says.
+    async fn last_words(&mut self) -> String {
+        let Some(mut open) = self.open.take() else { return "the stream ended".into() };
+        match self.patience.wait(open.answer()).await {
+            Ok(Err(status)) if !status.message().is_empty() => status.message().into(),
+            _ => "the stream ended".into(),
         }
     }
 
@@ -247,9 +256,8 @@ impl Session {
         let opened = self.ensure_open().await;
         opened.map_err(|status| Attempt { retry: is_broken(&status), error: status.into() })?;
         if self.write(ask).await.map_err(Attempt::last)? != Sent::Yes {
-            self.open = None;
-            let error = ClientError::Interrupted { request: ask.name(), message: "the stream ended".into() };
-            return Err(Attempt { retry: true, error });
+            let message = self.last_words().await;
+            return Err(Attempt { retry: true, error: ClientError::Interrupted { request: ask.name(), message } });
         }
         let Some(open) = &mut self.open else {
             return Err(Attempt::last(ClientError::protocol("expected a stream that was just opened")));

@@ -112,6 +112,7 @@ impl From<ServeError> for CliError {
     fn from(error: ServeError) -> Self {
         match error {
             ServeError::Store(error) => error.into(),
+            ServeError::Threads(_) => Self::failure(error.to_string(), "raise the limit on processes (ulimit -u)"),
             ServeError::Door(error) => Self::usage(error.to_string(), "see SECURITY.md for how such files are made"),
             ServeError::Reflection(_) => Self::failure(error.to_string(), "set RUST_LOG=info to see more"),
         }

@@ -25,6 +25,7 @@ use error::CliError;
 use mazeway_client::{ClientError, ConnectFiles, ConnectOptions};
 use mazeway_serving::{
     settings::{self, Settings, SettingsError},
+    telemetry::logs,
     token_command::TokenArgs,
 };
 use std::{path::PathBuf, process::ExitCode, time::Duration};
@@ -165,8 +166,10 @@ pub fn main() -> ExitCode {
         Err(SettingsError::Usage(error)) => return error::report_usage(&error),
         Err(error) => return CliError::usage(error.to_string(), "see what there is with 'learner config'").report(),
     };
-    let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("error"));
-    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
+    if !matches!(cli.command, Command::Serve(_)) {
+        let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("error"));
+        tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
+    }
     let runtime = match tokio::runtime::Builder::new_multi_thread().enable_all().build() {
         Ok(runtime) => runtime,
         Err(error) => {
@@ -200,7 +203,14 @@ async fn run(command: Command, settings: &Settings) -> Result<(), CliError> {
         Command::Repair(args) => maintain::repair(args).await,
         Command::Backup(args) => maintain::backup(args).await,
         Command::Vacuum(args) => maintain::vacuum(args).await,
-        Command::Serve(args) => serve::run(*args).await,
+        Command::Serve(args) => {
+            let spans = logs::start(args.telemetry(), "mazeway-learner").map_err(|error| {
+                CliError::usage(format!("no spans can be exported: {error}"), "see 'learner serve --help'")
+            })?;
+            let outcome = serve::run(*args).await;
+            spans.flush().await;
+            outcome
+        }
         Command::Config(_) => serve::print(&settings.effective()),
         Command::Token(args) => serve::token(&args),
     }

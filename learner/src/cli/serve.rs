@@ -3,8 +3,10 @@
 use super::{data_directory, error::CliError};
 use clap::Args;
 use mazeway_learner::{Config, config::Limits, store::Store};
-use mazeway_serving::{DoorConfig, ListenAddress, Listener, token_command::TokenArgs};
-use std::{io::Write as _, path::PathBuf};
+use mazeway_serving::{
+    DoorConfig, ListenAddress, Listener, TelemetryConfig, telemetry::endpoint, token_command::TokenArgs,
+};
+use std::{io::Write as _, path::PathBuf, sync::Arc};
 
 /// Where to listen, and on what data.
 #[derive(Debug, Args)]
@@ -31,6 +33,15 @@ pub struct ServeArgs {
     limits: Limits,
     #[command(flatten)]
     door: DoorConfig,
+    #[command(flatten)]
+    telemetry: TelemetryConfig,
+}
+
+impl ServeArgs {
+    /// What is shown of the service.
+    pub fn telemetry(&self) -> &TelemetryConfig {
+        &self.telemetry
+    }
 }
 
 /// What begins the name of every variable: `MAZEWAY_LEARNER_MAX_QUEUED_FITS` is `--max-queued-fits`.
@@ -53,9 +64,15 @@ pub fn print(text: &str) -> Result<(), CliError> {
 
 /// Serves until SIGINT or SIGTERM, then lets running calls end.
 pub async fn run(args: ServeArgs) -> Result<(), CliError> {
-    let ServeArgs { config: _, listen, data, insecure, limits, door } = args;
+    let ServeArgs { config: _, listen, data, insecure, limits, door, telemetry } = args;
     door.check_exposed(&listen, insecure).map_err(|(error, hint)| CliError::usage(error, hint))?;
     door.check().map_err(mazeway_learner::ServeError::from)?;
+    if !telemetry.is_local() && !insecure {
+        return Err(CliError::usage(
+            "the numbers of --metrics-listen would be reached from other machines, and nobody is asked who they are",
+            "listen on 127.0.0.1, or add --insecure where the network is trusted",
+        ));
+    }
     let data = data_directory(data)?;
     // A directory that cannot be used is said before the address is: who reads the line may connect.
     drop(Store::open(&data)?);
@@ -66,9 +83,26 @@ pub async fn run(args: ServeArgs) -> Result<(), CliError> {
     let stopped = stop_signal().map_err(no_signals)?;
     let listener = Listener::bind(&listen).await.map_err(cannot)?;
     let address = listener.address().map_err(cannot)?;
+    let numbers = Arc::new(mazeway_learner::telemetry());
+    let shown = match telemetry.metrics_listen {
+        None => None,
+        Some(address) => Some(endpoint::start(address, Arc::clone(&numbers)).await.map_err(|error| {
+            let hint = "take a free port: --metrics-listen 127.0.0.1:0";
+            CliError::failure(format!("cannot show numbers on {address}: {error}"), hint)
+        })?),
+    };
+    // Fits share the threads of this pool, where they have several chains or folds.
+    let yielding = |_| mazeway_learner::yield_to_others();
+    if let Err(error) = rayon::ThreadPoolBuilder::new().start_handler(yielding).build_global() {
+        tracing::debug!(%error, "threads that compute have the priority of all others");
+    }
     // Whoever started this may have closed the other end; the service serves all the same.
     let _ = writeln!(std::io::stdout(), "listening on {address}").and_then(|()| std::io::stdout().flush());
-    mazeway_learner::serve(Config { data, limits, door }, listener, stopped).await?;
+    if let Some(shown) = &shown {
+        let _ = writeln!(std::io::stdout(), "metrics on http://{}/metrics", shown.address())
+            .and_then(|()| std::io::stdout().flush());
+    }
+    mazeway_learner::serve_observed(Config { data, limits, door }, listener, numbers, stopped).await?;
     Ok(())
 }
 

@@ -1,23 +1,34 @@
-//! The stream of a fit: waits its turn, runs on a thread of its own, tells of its progress, stores the result.
+//! The stream of a fit: waits its turn, runs on a thread for fits, tells of its place and its progress, stores the result.
 //!
-//! Invariants: turns are taken in the order of the calls; progress is dropped rather than waited for, so a slow reader
-//! never slows a fit; a fit whose caller has gone stops at its next iteration and is not stored.
+//! Invariants: turns go round between callers (see `turns`); progress is dropped rather than waited for, so a slow reader
+//! never slows a fit; a fit whose caller has gone leaves the queue at once, or stops at its next iteration, and is not stored.
 
-use super::{blocking, fit_job::FitJob, fit_job::progress_message, status::CallError};
+mod numbers;
+mod pool;
+mod turns;
+
+use super::{fit_job::FitJob, fit_job::progress_message, status::CallError};
 use crate::{
     config::Limits,
     irl::TraceEntry,
-    store::{Store, StoreError},
+    store::{IdList, Store, StoreError},
 };
 use mazeway_proto::learner::{self as pb, fit_response::Event};
+use mazeway_serving::{Caller, telemetry::Telemetry};
+use numbers::Fits;
+use pool::{Place, Pool, Stand};
 use std::{
+    io,
     ops::ControlFlow,
     sync::Arc,
     time::{Duration, Instant},
 };
-use tokio::sync::{Semaphore, mpsc};
+use tokio::sync::{mpsc, oneshot};
 use tokio_util::sync::CancellationToken;
 use tonic::Status;
+use turns::Full;
+
+pub use pool::yield_to_others;
 
 /// Least time between two messages of progress.
 const PROGRESS_PERIOD: Duration = Duration::from_millis(100);
@@ -26,13 +37,14 @@ const PROGRESS_QUEUE: usize = 8;
 
 /// What a fit's stream carries.
 pub type Response = Result<pb::FitResponse, Status>;
+/// A fit and the ids of the trajectories that it used.
+type Fitted = (pb::Fit, IdList);
 
 /// Where fits wait and run.
 #[derive(Debug)]
 pub struct FitQueue {
-    running: Arc<Semaphore>,
-    admitted: Arc<Semaphore>,
-    limit: usize,
+    pool: Arc<Pool>,
+    fits: Fits,
     /// Cancelled when no further fit may begin.
     stopping: CancellationToken,
     /// Cancelled when running fits must end.
@@ -40,78 +52,125 @@ pub struct FitQueue {
 }
 
 impl FitQueue {
-    pub fn new(limits: &Limits, stopping: CancellationToken, aborting: CancellationToken) -> Self {
-        let running = limits.max_concurrent_fits.max(1);
-        let limit = limits.max_queued_fits;
-        Self {
-            running: Arc::new(Semaphore::new(running)),
-            admitted: Arc::new(Semaphore::new(running + limit)),
-            limit,
-            stopping,
-            aborting,
-        }
+    /// Starts the threads.
+    ///
+    /// # Errors
+    /// There are none to be had.
+    pub fn new(
+        limits: &Limits,
+        telemetry: &Telemetry,
+        stopping: CancellationToken,
+        aborting: CancellationToken,
+    ) -> io::Result<Self> {
+        let pool = Arc::new(Pool::start(limits.max_concurrent_fits, limits.max_queued_fits)?);
+        let read = |name, help, read: fn(&Pool) -> usize| {
+            // The numbers may be shown for longer than there are threads.
+            let pool = Arc::downgrade(&pool);
+            telemetry.read(name, help, move || pool.upgrade().map_or(0, |pool| read(&pool) as i64));
+        };
+        read("fits_waiting", "Fits that wait their turn", Pool::waiting);
+        read("fits_running", "Fits that run", Pool::running);
+        Ok(Self { pool, fits: Fits::new(telemetry), stopping, aborting })
     }
 
-    /// Takes a place in the queue, or refuses, and returns the stream that will tell how it goes.
-    pub fn submit(&self, job: FitJob, store: Store) -> Result<mpsc::Receiver<Response>, CallError> {
-        let Ok(admitted) = Arc::clone(&self.admitted).try_acquire_owned() else {
-            let (limit, got) = (self.limit as u64, self.limit as u64 + 1);
-            return Err(CallError::Limit { field: "method".into(), what: "fits that wait their turn", limit, got });
-        };
+    /// Takes a place in the queue, or refuses, and returns the stream that will tell how it goes. `quota` is how many fits
+    /// the caller may have, those that wait and those that run.
+    pub fn submit(
+        &self,
+        caller: &Caller,
+        quota: Option<usize>,
+        job: FitJob,
+        store: Store,
+    ) -> Result<mpsc::Receiver<Response>, CallError> {
         let (events, stream) = mpsc::channel(PROGRESS_QUEUE);
-        let running = Arc::clone(&self.running);
-        let (stopping, aborting) = (self.stopping.clone(), self.aborting.clone());
+        let (done, outcome) = oneshot::channel();
+        let cancelled = {
+            let (events, aborting) = (events.clone(), self.aborting.clone());
+            move || events.is_closed() || aborting.is_cancelled()
+        };
+        let work = {
+            let (events, store, fits) = (events.clone(), store.clone(), self.fits.clone());
+            move || {
+                let (method, begun) = (job.method_id(), Instant::now());
+                let outcome = run(job, &store, &events, cancelled);
+                fits.ended(method, &outcome, begun.elapsed());
+                // A caller that has gone wants nothing.
+                let _ = done.send(outcome);
+            }
+        };
+        let mut place = self.pool.submit(caller, quota, Box::new(work)).map_err(no_place)?;
+        let stopping = self.stopping.clone();
         tokio::spawn(async move {
-            let _admitted = admitted;
-            let _running = tokio::select! {
-                permit = running.acquire_owned() => permit,
-                () = events.closed() => return,
-                () = stopping.cancelled() => {
-                    let _ = events.send(Err(CallError::ShuttingDown.into())).await;
-                    return;
-                }
+            let last = match wait(&mut place, &events, &stopping).await {
+                Ok(()) => match outcome.await {
+                    Ok(fit) => keep(fit, &store).await,
+                    Err(_) => Err(CallError::Internal("the fit panicked".into())),
+                },
+                Err(error) => Err(error),
             };
-            let outcome = run(job, store, events.clone(), aborting).await;
+            drop(place);
             // A caller that has gone reads no more.
-            let _ = events.send(outcome.map(|fit| response(Event::Fit(fit))).map_err(Status::from)).await;
+            let _ = events.send(last.map(|fit| response(Event::Fit(fit))).map_err(Status::from)).await;
         });
         Ok(stream)
     }
 }
 
-async fn run(
-    job: FitJob,
-    store: Store,
-    events: mpsc::Sender<Response>,
-    aborting: CancellationToken,
-) -> Result<pb::Fit, CallError> {
-    let reader = store.clone();
-    let cancelled = {
-        let events = events.clone();
-        move || events.is_closed() || aborting.is_cancelled()
+fn no_place(full: Full) -> CallError {
+    let (what, limit) = match full {
+        Full::Queue { limit } => ("fits that wait their turn", limit),
+        Full::Share { waiting } => ("fits of one caller that wait their turn, now that the queue is so long", waiting),
+        Full::Quota { limit } => ("fits of this caller at a time, those that wait included", limit),
     };
-    let (fit, ids) = blocking({
-        let (events, cancelled) = (events.clone(), cancelled.clone());
-        move || {
-            let mut last: Option<Instant> = None;
-            let progress = |entry: &TraceEntry| {
-                if cancelled() {
-                    return ControlFlow::Break(());
-                }
-                if last.is_none_or(|last| last.elapsed() >= PROGRESS_PERIOD) {
-                    last = Some(Instant::now());
-                    // A queue that is full has a reader that is slow: the next message will do as well.
-                    let _ = events.try_send(Ok(response(Event::Progress(progress_message(entry)))));
-                }
-                ControlFlow::Continue(())
-            };
-            job.run(&reader, progress, &cancelled)
-        }
-    })
-    .await?;
-    if cancelled() {
-        return Err(CallError::Cancelled);
+    CallError::Limit { field: "method".into(), what, limit: limit as u64, got: limit as u64 + 1 }
+}
+
+/// Waits for the turn and tells where it is.
+async fn wait(
+    place: &mut Place,
+    events: &mpsc::Sender<Response>,
+    stopping: &CancellationToken,
+) -> Result<(), CallError> {
+    let mut stand = place.stand();
+    while let Stand::Waiting { place: rank, length } = stand {
+        let queued = pb::FitQueued { place: rank as u32, length: length as u32 };
+        // A queue that is full has a reader that is slow: the next place will do as well.
+        let _ = events.try_send(Ok(response(Event::Queued(queued))));
+        stand = tokio::select! {
+            moved = place.moved() => moved,
+            () = events.closed() => return Err(CallError::Cancelled),
+            () = stopping.cancelled() => return Err(CallError::ShuttingDown),
+        };
     }
+    Ok(())
+}
+
+/// Fits; blocks.
+fn run(
+    job: FitJob,
+    store: &Store,
+    events: &mpsc::Sender<Response>,
+    cancelled: impl Fn() -> bool,
+) -> Result<Fitted, CallError> {
+    let mut last: Option<Instant> = None;
+    let progress = |entry: &TraceEntry| {
+        if cancelled() {
+            return ControlFlow::Break(());
+        }
+        if last.is_none_or(|last| last.elapsed() >= PROGRESS_PERIOD) {
+            last = Some(Instant::now());
+            // A queue that is full has a reader that is slow: the next message will do as well.
+            let _ = events.try_send(Ok(response(Event::Progress(progress_message(entry)))));
+        }
+        ControlFlow::Continue(())
+    };
+    let fit = job.run(store, progress, &cancelled)?;
+    if cancelled() { Err(CallError::Cancelled) } else { Ok(fit) }
+}
+
+/// Stores a fit that came to an end.
+async fn keep(fitted: Result<Fitted, CallError>, store: &Store) -> Result<pb::Fit, CallError> {
+    let (fit, ids) = fitted?;
     let mut unstored = fit.clone();
     match store.put_fit(fit, ids).await {
         Err(error @ StoreError::DiskFull { .. }) => {

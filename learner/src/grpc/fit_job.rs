@@ -66,6 +66,11 @@ impl FitJob {
         Ok(Self { request, method, filter, options })
     }
 
+    /// Its method.
+    pub fn method_id(&self) -> &'static str {
+        self.method.id()
+    }
+
     /// Reads the data, fits, and says everything that is worth storing, and the ids of the trajectories used. Calls
     /// `progress` after every iteration and asks `cancelled` between trajectories; blocks.
     pub fn run(

@@ -15,8 +15,9 @@ mod service;
 mod status;
 mod to_proto;
 
+pub use fit::yield_to_others;
 pub use options::{from_proto as fit_options, stopped_from_proto as stopped};
-pub use serve::{ServeError, serve};
+pub use serve::{ServeError, serve, serve_observed, telemetry};
 pub use status::CallError;
 
 /// Runs work that takes a while off the async threads.

@@ -3,24 +3,31 @@
 use super::{rules::rule, service::LearnerGrpc};
 use crate::{
     config::Config,
-    store::{Store, StoreError, StoreOptions},
+    store::{Store, StoreError, StoreOptions, store_bytes},
 };
 use mazeway_proto::learner::learner_service_server::LearnerServiceServer;
 use mazeway_serving::{
     DoorError, Listener,
     connections::Gate,
     door::Door,
+    telemetry::Telemetry,
     transport::{Transport, Wire},
 };
-use std::{future::Future, sync::Arc};
+use std::{future::Future, sync::Arc, time::Duration};
 use tokio::task::spawn_blocking;
 use tokio_util::{sync::CancellationToken, task::TaskTracker};
 use tonic::service::Routes;
+use tonic_health::{ServingStatus, server::HealthReporter};
 
 /// Bytes of a stream, or of all streams of a connection, that may be under way.
 const WINDOW_BYTES: u32 = 4 << 20;
 /// Largest frame taken in.
 const FRAME_BYTES: u32 = 64 << 10;
+
+/// What health calls the taking of recordings, which needs room on the disk; all else goes on without.
+const RECORDING: &str = "mazeway.learner.v1.LearnerService/RecordTrajectories";
+/// Time between two looks at the store.
+const STORE_PERIOD: Duration = Duration::from_secs(1);
 
 /// Why a service could not begin or go on.
 #[derive(Debug, thiserror::Error)]
@@ -31,6 +38,9 @@ pub enum ServeError {
     /// A certificate, a key or the file of tokens does not serve.
     #[error(transparent)]
     Door(#[from] DoorError),
+    /// There are no threads to fit on.
+    #[error("no threads to fit on: {0}")]
+    Threads(std::io::Error),
     /// The descriptors of the protocol cannot be read.
     #[error("server reflection cannot read the descriptors: {0}")]
     Reflection(#[from] tonic_reflection::server::Error),
@@ -49,13 +59,32 @@ pub async fn serve(
     listener: impl Into<Listener>,
     shutdown: impl Future<Output = ()>,
 ) -> Result<(), ServeError> {
-    let door = Arc::new(Door::new(&config.door, rule)?);
-    let gate = Gate::new(listener.into(), config.door.max_connections);
+    serve_observed(config, listener, Arc::new(telemetry()), shutdown).await
+}
+
+/// Numbers of a learner service.
+pub fn telemetry() -> Telemetry {
+    Telemetry::new("mazeway_learner")
+}
+
+/// As [`serve`]; what happens is counted there.
+///
+/// # Errors
+/// As [`serve`].
+pub async fn serve_observed(
+    config: Config,
+    listener: impl Into<Listener>,
+    telemetry: Arc<Telemetry>,
+    shutdown: impl Future<Output = ()>,
+) -> Result<(), ServeError> {
+    let door = Arc::new(Door::new(&config.door, rule, &telemetry)?);
+    let gate = Gate::new(listener.into(), config.door.max_connections, &telemetry);
     let data = config.data.clone();
     let options = StoreOptions { max_bytes: config.limits.max_store_bytes, ..StoreOptions::default() };
     let opening = spawn_blocking(move || Store::open_with(&data, options));
     let store = opening.await.unwrap_or(Err(StoreError::Closed))?;
-    let outcome = serve_store(config, store.clone(), door, gate, shutdown).await;
+    let outcome = serve_store(config, store.clone(), door, gate, &telemetry, shutdown).await;
+    telemetry.set_serving(false);
     // The last clone waits for the writer.
     let _ = spawn_blocking(move || drop(store)).await;
     outcome
@@ -66,6 +95,7 @@ async fn serve_store(
     store: Store,
     door: Arc<Door>,
     gate: Gate,
+    telemetry: &Telemetry,
     shutdown: impl Future<Output = ()>,
 ) -> Result<(), ServeError> {
     let (stopping, aborting) = (CancellationToken::new(), CancellationToken::new());
@@ -82,10 +112,13 @@ async fn serve_store(
     };
     let max_message_bytes = limits.max_message_bytes;
     // What is sent is bounded by what was accepted: a fit's arrays by its model, a page of trajectories by its size.
-    let learner = LearnerServiceServer::new(LearnerGrpc::new(store, limits, stopping.clone(), aborting))
-        .max_decoding_message_size(max_message_bytes);
+    let learner =
+        LearnerGrpc::new(store.clone(), limits, telemetry, stopping.clone(), aborting).map_err(ServeError::Threads)?;
+    let learner = LearnerServiceServer::new(learner).max_decoding_message_size(max_message_bytes);
     let (health, health_service) = tonic_health::server::health_reporter();
     health.set_serving::<LearnerServiceServer<LearnerGrpc>>().await;
+    health.set_service_status(RECORDING, ServingStatus::Serving).await;
+    show(&store, telemetry);
     let reflection = || {
         tonic_reflection::server::Builder::configure()
             .register_encoded_file_descriptor_set(mazeway_proto::FILE_DESCRIPTOR_SET)
@@ -104,10 +137,16 @@ async fn serve_store(
             connections.spawn(async move { transport.serve(accepted, place, &stopping, grace).await });
         }
     };
+    telemetry.set_serving(true);
     tokio::select! {
         () = take_in => {}
+        () = watch_store(&store, &health) => {}
         () = door.guard() => {}
         () = shutdown => {}
+    }
+    telemetry.set_serving(false);
+    for service in ["", RECORDING] {
+        health.set_service_status(service, ServingStatus::NotServing).await;
     }
     health.set_not_serving::<LearnerServiceServer<LearnerGrpc>>().await;
     // Nobody is let in any more, and a Unix socket is gone, before running calls are waited for.
@@ -116,4 +155,34 @@ async fn serve_store(
     connections.close();
     connections.wait().await;
     Ok(())
+}
+
+/// Shows what the store says of itself. The numbers may be shown for longer than it is open.
+fn show(store: &Store, telemetry: &Telemetry) {
+    store.activity().show(telemetry);
+    let (activity, file) = (Arc::downgrade(store.activity()), store.path().to_owned());
+    telemetry.read("writable", "1 where the last write of the store succeeded, 0 where it failed", move || {
+        activity.upgrade().map_or(0, |activity| i64::from(activity.is_writable()))
+    });
+    telemetry.read("store_bytes", "Bytes of the database and its log on the disk", move || store_bytes(&file) as i64);
+}
+
+/// Tells whether recordings can be taken, and tries a write now and then where the last failed: who balances load by health
+/// sends none meanwhile that could find out.
+async fn watch_store(store: &Store, health: &HealthReporter) {
+    let mut known = true;
+    loop {
+        tokio::time::sleep(STORE_PERIOD).await;
+        if !store.activity().is_writable() {
+            // How it went is noted by the store itself.
+            let _ = store.try_writing().await;
+        }
+        let writable = store.activity().is_writable();
+        if writable != known {
+            known = writable;
+            tracing::warn!(writable, "the store's disk or quota changed what recordings meet");
+            let status = if writable { ServingStatus::Serving } else { ServingStatus::NotServing };
+            health.set_service_status(RECORDING, status).await;
+        }
+    }
 }

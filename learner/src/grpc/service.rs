@@ -16,8 +16,8 @@ use crate::{
 };
 use futures_util::Stream;
 use mazeway_proto::learner::{self as pb, learner_service_server::LearnerService};
-use mazeway_serving::Caller;
-use std::{pin::Pin, sync::Arc};
+use mazeway_serving::{Caller, telemetry::Telemetry};
+use std::{io, pin::Pin, sync::Arc};
 use tokio::sync::{Semaphore, mpsc};
 use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::sync::CancellationToken;
@@ -47,9 +47,19 @@ pub struct LearnerGrpc {
 
 impl LearnerGrpc {
     /// `stopping` ends recording streams and keeps further fits from beginning; `aborting` ends running fits.
-    pub fn new(store: Store, limits: Limits, stopping: CancellationToken, aborting: CancellationToken) -> Self {
-        let fits = FitQueue::new(&limits, stopping.clone(), aborting);
-        Self { store, limits: Arc::new(limits), fits, models: Arc::new(Semaphore::new(CONCURRENT_MODELS)), stopping }
+    ///
+    /// # Errors
+    /// There are no threads for fits.
+    pub fn new(
+        store: Store,
+        limits: Limits,
+        telemetry: &Telemetry,
+        stopping: CancellationToken,
+        aborting: CancellationToken,
+    ) -> io::Result<Self> {
+        let fits = FitQueue::new(&limits, telemetry, stopping.clone(), aborting)?;
+        let models = Arc::new(Semaphore::new(CONCURRENT_MODELS));
+        Ok(Self { store, limits: Arc::new(limits), fits, models, stopping })
     }
 
     /// Reads the store off the async threads.
@@ -207,8 +217,9 @@ impl LearnerService for LearnerGrpc {
     }
 
     async fn fit(&self, request: Request<pb::FitRequest>) -> Result<Response<Self::FitStream>, Status> {
+        let caller = Caller::of(&request);
         let job = FitJob::new(request.into_inner(), &self.limits)?;
-        let stream = self.fits.submit(job, self.store.clone())?;
+        let stream = self.fits.submit(&caller, caller.quotas().max_fits, job, self.store.clone())?;
         Ok(Response::new(ReceiverStream::new(stream)))
     }
 

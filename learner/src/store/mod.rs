@@ -8,6 +8,7 @@
 //! Deliberately absent: the wire (see `grpc`), and any change of what is stored; there is recording and
 //! deleting.
 
+mod activity;
 mod allowance;
 mod backup;
 mod check;
@@ -28,6 +29,7 @@ mod writer;
 #[cfg(test)]
 mod tests;
 
+pub use activity::Activity;
 pub use allowance::Allowance;
 pub use backup::backup;
 pub use check::{Damage, Kind, Tally, Verification, verify};
@@ -47,6 +49,7 @@ pub use schema::FILE_NAME;
 pub use trajectories::{Cursor, TrajectorySummary};
 pub use writer::Pending;
 
+use activity::Recorded;
 use mazeway_proto::learner as pb;
 use rusqlite::Connection;
 use std::{
@@ -66,6 +69,8 @@ const PENDING_BYTES: usize = 256 << 20;
 const PENDING_UNIT: usize = 1 << 10;
 /// Bytes of arrays that a reader holds at a time, one trajectory more at most.
 const PAGE_BYTES: usize = 1 << 20;
+/// Bytes that are written on trial where the last write failed: so much must fit before recordings are taken again.
+const TRIAL_BYTES: usize = 64 << 10;
 /// Idle reading connections that are kept.
 const IDLE_READERS: usize = 8;
 
@@ -81,6 +86,7 @@ struct Inner {
     // Dropped in this order: the last connection goes before the sign that somebody uses the directory.
     readers: Mutex<Vec<Connection>>,
     writer: Writer,
+    activity: Arc<Activity>,
     pending: Arc<Semaphore>,
     _user: File,
 }
@@ -94,9 +100,10 @@ impl Store {
     /// As [`Store::open`], with options. Blocks.
     pub fn open_with(directory: &Path, options: StoreOptions) -> Result<Self, StoreError> {
         let schema::Opened { path, connection, user } = schema::open(directory, &options)?;
-        let writer = Writer::start(connection, path.clone())?;
+        let activity = Arc::new(Activity::default());
+        let writer = Writer::start(connection, path.clone(), Arc::clone(&activity))?;
         let pending = Arc::new(Semaphore::new(PENDING_BYTES / PENDING_UNIT));
-        Ok(Self(Arc::new(Inner { path, options, readers: Mutex::default(), writer, pending, _user: user })))
+        Ok(Self(Arc::new(Inner { path, options, readers: Mutex::default(), writer, activity, pending, _user: user })))
     }
 
     /// As [`Store::open`], where there is a store already. Blocks.
@@ -139,21 +146,45 @@ impl Store {
         let quota = self.0.options.max_bytes;
         let job = move |work: &mut writer::Work<'_>| {
             let _pending = pending;
-            let (mut stored, mut stored_bytes) = (0, 0);
+            let (mut stored, mut recorded) = (0, Recorded::default());
             for (index, recording) in recordings.iter().enumerate() {
                 let new = trajectories::insert(work.connection, work.path, work.collections, recording, index)?;
                 stored += u32::from(new);
-                stored_bytes += if new { recording.packed_bytes() as u64 } else { 0 };
+                if new {
+                    recorded.add(recording);
+                }
             }
             if stored > 0 {
                 check_quota(work, quota)?;
                 if let Some(allowance) = &allowance {
-                    allowance.charge(work.connection, work.path, stored_bytes)?;
+                    allowance.charge(work.connection, work.path, recorded.bytes())?;
                 }
+                work.recorded.join(recorded);
             }
             Ok(stored)
         };
         self.0.writer.queue(job).await
+    }
+
+    /// What it has done since it was opened.
+    pub fn activity(&self) -> &Arc<Activity> {
+        &self.0.activity
+    }
+
+    /// Writes [`TRIAL_BYTES`] and takes them back in the same commit, to find out whether there is room for recordings again.
+    ///
+    /// # Errors
+    /// There is none, or the disk fails.
+    pub async fn try_writing(&self) -> Result<(), StoreError> {
+        let quota = self.0.options.max_bytes;
+        let job = move |work: &mut writer::Work<'_>| {
+            let fail = |e: rusqlite::Error| StoreError::from_sqlite(work.path, &e);
+            let write = format!("CREATE TABLE trial(bytes); INSERT INTO trial VALUES (zeroblob({TRIAL_BYTES}))");
+            work.connection.execute_batch(&write).map_err(fail)?;
+            check_quota(work, quota)?;
+            work.connection.execute_batch("DROP TABLE trial").map_err(fail)
+        };
+        self.0.writer.queue(job).await?.committed().await
     }
 
     /// Deletes what the filter selects and returns how many there were.
@@ -382,6 +413,12 @@ impl Drop for Reader<'_> {
             idle.extend(self.connection.take());
         }
     }
+}
+
+/// Bytes of a database and its log on the disk. Blocks, shortly.
+pub fn store_bytes(path: &Path) -> u64 {
+    let log = path.with_extension("sqlite3-wal");
+    [path, log.as_path()].iter().filter_map(|path| path.metadata().ok()).map(|file| file.len()).sum()
 }
 
 /// Microseconds since the Unix epoch.

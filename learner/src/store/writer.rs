@@ -4,11 +4,13 @@
 //! Invariant: an answer is given only after the commit that holds it has returned. A job that fails takes back its own
 //! changes and nobody else's.
 
-use super::{StoreError, trajectories::CollectionCache};
+use super::{Activity, StoreError, activity::Recorded, trajectories::CollectionCache};
 use rusqlite::{Connection, TransactionBehavior};
 use std::{
     path::{Path, PathBuf},
+    sync::Arc,
     thread,
+    time::Instant,
 };
 use tokio::sync::{mpsc, oneshot};
 
@@ -22,6 +24,8 @@ pub(super) struct Work<'a> {
     pub(super) connection: &'a Connection,
     pub(super) path: &'a Path,
     pub(super) collections: &'a mut CollectionCache,
+    /// What was stored and is not committed yet.
+    pub(super) recorded: &'a mut Recorded,
     /// Why the job failed.
     failed: Option<StoreError>,
 }
@@ -50,13 +54,13 @@ pub(super) struct Writer {
 }
 
 impl Writer {
-    pub(super) fn start(connection: Connection, path: PathBuf) -> Result<Self, StoreError> {
+    pub(super) fn start(connection: Connection, path: PathBuf, activity: Arc<Activity>) -> Result<Self, StoreError> {
         let (jobs, queue) = mpsc::channel(QUEUED_JOBS);
         let thread = thread::Builder::new()
             .name("store-writer".into())
             .spawn({
                 let path = path.clone();
-                move || write(connection, &path, queue)
+                move || write(connection, &path, queue, &activity)
             })
             .map_err(|e| StoreError::directory(&path, &e))?;
         Ok(Self { path, jobs: Some(jobs), thread: Some(thread) })
@@ -124,7 +128,7 @@ impl Drop for Writer {
     }
 }
 
-fn write(mut connection: Connection, path: &Path, mut queue: mpsc::Receiver<Job>) {
+fn write(mut connection: Connection, path: &Path, mut queue: mpsc::Receiver<Job>, activity: &Activity) {
     let mut collections = CollectionCache::new();
     let mut next = None;
     while let Some(job) = next.take().or_else(|| queue.blocking_recv()) {
@@ -145,7 +149,9 @@ fn write(mut connection: Connection, path: &Path, mut queue: mpsc::Receiver<Job>
             }
             Err(_) => None,
         };
-        let result = commit_together(&mut connection, path, &mut collections, first, more, &mut answers);
+        let result = commit_together(&mut connection, path, &mut collections, first, more, &mut answers, activity);
+        activity.note(result.as_ref().err());
+        let result = result.map(|refused| activity.note(refused.as_ref()));
         if let Err(error) = &result {
             tracing::error!(%error, jobs = answers.len(), "a commit failed");
             // Rows of collections that were made in it are gone.
@@ -157,6 +163,7 @@ fn write(mut connection: Connection, path: &Path, mut queue: mpsc::Receiver<Job>
     }
 }
 
+/// Runs jobs in one transaction. Gives the error of the last that failed, which took back its own changes alone.
 fn commit_together(
     connection: &mut Connection,
     path: &Path,
@@ -164,7 +171,8 @@ fn commit_together(
     first: Shared,
     mut more: impl FnMut() -> Option<Shared>,
     answers: &mut Vec<Answer>,
-) -> Result<(), StoreError> {
+    activity: &Activity,
+) -> Result<Option<StoreError>, StoreError> {
     let fail = |e: rusqlite::Error| StoreError::from_sqlite(path, &e);
     let transaction = match connection.transaction_with_behavior(TransactionBehavior::Immediate) {
         Ok(transaction) => transaction,
@@ -175,14 +183,16 @@ fn commit_together(
         }
     };
     let mut job = first;
+    let (mut recorded, mut refused) = (Recorded::default(), None);
     loop {
-        let mut work = Work { connection: &transaction, path, collections, failed: None };
+        let mut work = Work { connection: &transaction, path, collections, recorded: &mut recorded, failed: None };
         answers.push(job(Ok(&mut work)));
         // Some errors, a full disk among them, make SQLite roll back the whole transaction and not the statement alone.
-        if let Some(error) = work.failed
-            && transaction.is_autocommit()
-        {
-            return Err(error);
+        if let Some(error) = work.failed {
+            if transaction.is_autocommit() {
+                return Err(error);
+            }
+            refused = Some(error);
         }
         if answers.len() >= JOBS_A_COMMIT {
             break;
@@ -192,7 +202,10 @@ fn commit_together(
             None => break,
         }
     }
-    transaction.commit().map_err(fail)
+    let begun = Instant::now();
+    transaction.commit().map_err(fail)?;
+    activity.committed(answers.len(), recorded, begun.elapsed());
+    Ok(refused)
 }
 
 /// Runs a job so that its failure leaves no trace.

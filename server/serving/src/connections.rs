@@ -1,7 +1,11 @@
 //! Connections, encrypted or not, and a bound on them, which the transport has not: one above it is closed at once, so that
 //! its client learns of it.
 
-use super::listen::{Accepted, Listener, Socket};
+use super::{
+    listen::{Accepted, Listener},
+    socket::Socket,
+    telemetry::{Connections, Telemetry},
+};
 use std::{
     io,
     pin::Pin,
@@ -25,22 +29,34 @@ const PAUSE: Duration = Duration::from_millis(50);
 #[derive(Debug)]
 pub struct Gate {
     listener: Listener,
+    numbers: Connections,
     places: Arc<Semaphore>,
     max: usize,
 }
 
 impl Gate {
     /// Takes at most `max` connections at a time from `listener`.
-    pub fn new(listener: Listener, max: usize) -> Self {
-        Self { listener, places: Arc::new(Semaphore::new(max.min(Semaphore::MAX_PERMITS))), max }
+    pub fn new(listener: Listener, max: usize, telemetry: &Telemetry) -> Self {
+        let places = Arc::new(Semaphore::new(max.min(Semaphore::MAX_PERMITS)));
+        let (free, all) = (Arc::downgrade(&places), places.available_permits());
+        telemetry.read("connections", "Connections that are open", move || {
+            free.upgrade().map_or(0, |places| all.saturating_sub(places.available_permits()) as i64)
+        });
+        Self { listener, numbers: telemetry.connections.clone(), places, max }
     }
 
     /// The next connection within the limit, and its place.
     pub async fn next(&self) -> (Accepted, OwnedSemaphorePermit) {
         loop {
             match (self.listener.accept().await, Arc::clone(&self.places).try_acquire_owned()) {
-                (Ok(connection), Ok(place)) => return (connection, place),
-                (Ok(_), Err(_)) => tracing::warn!(max = self.max, "a connection beyond the limit was closed"),
+                (Ok(connection), Ok(place)) => {
+                    self.numbers.accepted.add(1);
+                    return (connection.counted(self.numbers.clone()), place);
+                }
+                (Ok(_), Err(_)) => {
+                    self.numbers.refused.add(1);
+                    tracing::warn!(max = self.max, "a connection beyond the limit was closed");
+                }
                 (Err(error), _) => {
                     tracing::warn!(%error, "a connection could not be taken");
                     tokio::time::sleep(PAUSE).await;

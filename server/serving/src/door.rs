@@ -8,6 +8,10 @@ use crate::{
     config::{DoorConfig, DoorError},
     keyring::Keyring,
     rules::{Need, Rule, Rules, common},
+    telemetry::{
+        Telemetry,
+        calls::{Calls, Observed},
+    },
     watch::{Call, Visit, Watch},
 };
 use bytes::Bytes;
@@ -24,6 +28,7 @@ use std::{
 use tokio::time::{Instant, Sleep, sleep_until, timeout_at};
 use tonic::{Status, body::Body, service::Routes};
 use tower::ServiceExt as _;
+use tracing::Instrument as _;
 
 /// Bytes of an answer that the transport is given at a time: it counts a stream that it was given everything of as done.
 const SLICE_BYTES: usize = 64 << 10;
@@ -42,6 +47,7 @@ pub struct Door {
     max_call_deadline: Duration,
     /// Who and what is inside.
     pub watch: Arc<Watch>,
+    calls: Calls,
 }
 
 impl Door {
@@ -49,7 +55,7 @@ impl Door {
     ///
     /// # Errors
     /// The file of tokens does not serve.
-    pub fn new(config: &DoorConfig, rules: Rules) -> Result<Self, DoorError> {
+    pub fn new(config: &DoorConfig, rules: Rules, telemetry: &Telemetry) -> Result<Self, DoorError> {
         Ok(Self {
             keyring: config.keyring()?,
             mutual: config.tls_client_ca.is_some(),
@@ -58,6 +64,7 @@ impl Door {
             call_deadline: config.call_deadline,
             max_call_deadline: config.max_call_deadline,
             watch: Watch::new(config),
+            calls: telemetry.calls.clone(),
         })
     }
 
@@ -152,11 +159,12 @@ impl Entrance {
 }
 
 impl hyper::service::Service<Request<Incoming>> for Entrance {
-    type Response = Response<Answer>;
+    type Response = Response<Observed<Answer>>;
     type Error = Infallible;
-    type Future = Pin<Box<dyn Future<Output = Result<Response<Answer>, Infallible>> + Send>>;
+    type Future = Pin<Box<dyn Future<Output = Result<Response<Observed<Answer>>, Infallible>> + Send>>;
 
     fn call(&self, mut request: Request<Incoming>) -> Self::Future {
+        let observed = self.door.calls.begin(&request);
         let entered = self.enter(&mut request);
         let caller = entered.as_ref().map_or_else(|_| Caller::anybody(), |(caller, ..)| caller.clone());
         let call = self.visit.call(caller);
@@ -164,11 +172,12 @@ impl hyper::service::Service<Request<Incoming>> for Entrance {
             Ok(entered) => entered,
             Err(status) => {
                 let response = status.into_http::<Body>().map(|body| Answer::new(body, call, None));
-                return Box::pin(std::future::ready(Ok(response)));
+                return Box::pin(std::future::ready(Ok(observed.answer(response))));
             }
         };
+        observed.by(&caller);
         request.extensions_mut().insert(caller);
-        let answering = self.routes.clone().oneshot(request.map(Body::new));
+        let answering = self.routes.clone().oneshot(request.map(Body::new)).instrument(observed.span().clone());
         Box::pin(async move {
             let response = match deadline {
                 None => answering.await?,
@@ -177,7 +186,7 @@ impl hyper::service::Service<Request<Incoming>> for Entrance {
                     Err(_) => too_late().into_http(),
                 },
             };
-            Ok(response.map(|body| Answer::new(body, call, deadline.filter(|_| streams))))
+            Ok(observed.answer(response.map(|body| Answer::new(body, call, deadline.filter(|_| streams)))))
         })
     }
 }

@@ -7,11 +7,14 @@ pub mod caller;
 pub mod config;
 pub mod connections;
 pub mod door;
+pub mod fair;
 pub mod grant;
 pub mod keyring;
 pub mod listen;
 pub mod rules;
 pub mod settings;
+pub mod socket;
+pub mod telemetry;
 pub mod tls;
 pub mod token_command;
 pub mod tokens;
@@ -21,6 +24,7 @@ pub mod watch;
 pub use caller::Caller;
 pub use config::{DoorConfig, DoorError};
 pub use listen::{ListenAddress, Listener};
+pub use telemetry::{Telemetry, TelemetryConfig};
 
 /// A number for something that went wrong inside: the log has it beside what happened, the caller is told no more.
 pub fn incident() -> String {

@@ -3,6 +3,7 @@
 //! Invariants: a Unix socket admits its owner alone from the moment that it is there; one that a dead server left behind is
 //! replaced, one that somebody listens on, or a file that is none, never; it goes with its listener.
 
+use crate::{socket::Socket, telemetry::Connections};
 use std::{fmt, io, net::SocketAddr, path::PathBuf, str::FromStr};
 use tokio::net::{TcpListener, TcpStream};
 #[cfg(unix)]
@@ -111,10 +112,10 @@ impl Listener {
             Self::Tcp(listener) => {
                 let (stream, _) = listener.accept().await?;
                 stream.set_nodelay(true)?;
-                stream.into_std().map(Accepted::Tcp)
+                stream.into_std().map(Stream::Tcp).map(Accepted::from)
             }
             #[cfg(unix)]
-            Self::Unix(socket) => socket.listener.accept().await?.0.into_std().map(Accepted::Unix),
+            Self::Unix(socket) => socket.listener.accept().await?.0.into_std().map(Stream::Unix).map(Accepted::from),
         }
     }
 }
@@ -127,7 +128,14 @@ impl From<TcpListener> for Listener {
 
 /// A connection that belongs to no runtime yet.
 #[derive(Debug)]
-pub enum Accepted {
+pub struct Accepted {
+    stream: Stream,
+    numbers: Connections,
+}
+
+/// What the operating system gave.
+#[derive(Debug)]
+enum Stream {
     /// Over TCP.
     Tcp(std::net::TcpStream),
     /// Over a Unix socket.
@@ -135,24 +143,36 @@ pub enum Accepted {
     Unix(std::os::unix::net::UnixStream),
 }
 
-/// A connection of either kind.
-#[cfg(unix)]
-pub type Socket = Either<TcpStream, UnixStream>;
-/// A connection; there is but one kind here.
-#[cfg(not(unix))]
-pub type Socket = Either<TcpStream, TcpStream>;
+impl From<Stream> for Accepted {
+    fn from(stream: Stream) -> Self {
+        Self { stream, numbers: Connections::nobodys() }
+    }
+}
+
+impl From<std::net::TcpStream> for Accepted {
+    fn from(stream: std::net::TcpStream) -> Self {
+        Stream::Tcp(stream).into()
+    }
+}
 
 impl Accepted {
-    /// Hands the connection to the present runtime.
+    /// Its bytes are counted there.
+    #[must_use]
+    pub fn counted(self, numbers: Connections) -> Self {
+        Self { numbers, ..self }
+    }
+
+    /// Hands the connection to the present runtime, and to the lane of the present thread if it has one.
     ///
     /// # Errors
     /// The runtime cannot watch it.
     pub fn into_socket(self) -> io::Result<Socket> {
-        match self {
-            Self::Tcp(stream) => TcpStream::from_std(stream).map(Either::Left),
+        let stream = match self.stream {
+            Stream::Tcp(stream) => TcpStream::from_std(stream).map(Either::Left),
             #[cfg(unix)]
-            Self::Unix(stream) => UnixStream::from_std(stream).map(Either::Right),
-        }
+            Stream::Unix(stream) => UnixStream::from_std(stream).map(Either::Right),
+        };
+        Ok(Socket::new(stream?, self.numbers))
     }
 }
 

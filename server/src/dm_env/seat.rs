@@ -15,7 +15,7 @@ use crate::{
 };
 use bytes::BytesMut;
 use mazeway_proto::dm_env::{EnvironmentStateType, StepRequest};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 use tokio::sync::{mpsc, oneshot};
 
 /// A reset that another connection asks for, told to the agent by its next step.
@@ -100,13 +100,16 @@ impl Seat {
         let requested = self.specs.requested(&request.requested_observations)?;
         let interrupted = self.running && self.interrupted(host);
         let Self { guard, specs, running, actions, lengths, .. } = self;
+        let num_envs = guard.options().num_envs;
         let world = World::of(&mut **guard).expect("seen when it was taken");
         let state = if interrupted {
             *running = false;
             EnvironmentStateType::Interrupted
         } else if *running {
             specs.actions(&request.actions, actions)?;
+            let begun = Instant::now();
             let buffers = world.step(actions)?;
+            host.numbers.stepped(num_envs, begun.elapsed());
             let ended = (buffers.terminated()[0] == 1, buffers.truncated()[0] == 1);
             match ended {
                 // Of a batch each environment begins anew by itself, and the sequence never ends.

@@ -21,7 +21,9 @@ use std::sync::Arc;
 use tokio_util::sync::CancellationToken;
 
 fn process() -> Process {
-    let host = Host::new(Config { max_total_envs: 64, ..Config::default() }, CancellationToken::new());
+    let telemetry = mazeway_serving::Telemetry::new("test");
+    let config = Config { max_total_envs: 64, ..Config::default() };
+    let host = Host::new(config, &telemetry, CancellationToken::new());
     Process::new(Arc::new(host), mazeway_serving::Caller::anybody())
 }
 

@@ -1,6 +1,6 @@
 //! What every call of a server shares.
 
-use super::{status::CallError, watch::Gallery};
+use super::{numbers::Numbers, status::CallError, watch::Gallery};
 use crate::{
     batch::{BatchOptions, Layout},
     config::Config,
@@ -11,7 +11,7 @@ use crate::{
     sim::TabularModel,
 };
 use mazeway_proto::env as pb;
-use mazeway_serving::Caller;
+use mazeway_serving::{Caller, Telemetry};
 use std::{
     sync::Arc,
     time::{Duration, Instant},
@@ -24,6 +24,7 @@ pub struct Host {
     pub config: Config,
     pub registry: Registry,
     pub sessions: Arc<Sessions>,
+    pub numbers: Numbers,
     /// A permit a running roll-out.
     pub rollouts: Arc<Semaphore>,
     /// A permit a model that is looked up or computed.
@@ -35,10 +36,12 @@ pub struct Host {
 }
 
 impl Host {
-    pub fn new(config: Config, shutdown: CancellationToken) -> Self {
+    pub fn new(config: Config, telemetry: &Telemetry, shutdown: CancellationToken) -> Self {
+        let sessions = Arc::new(Sessions::new(config.limits()));
         Self {
             registry: Registry::new(),
-            sessions: Arc::new(Sessions::new(config.limits())),
+            numbers: Numbers::new(telemetry, &sessions),
+            sessions,
             rollouts: Arc::new(Semaphore::new(config.max_concurrent_rollouts)),
             models: Semaphore::new(config.max_concurrent_models.max(1)),
             gallery: Gallery::default(),
@@ -53,6 +56,17 @@ impl Host {
         caller: &Caller,
         asked: &NewSession,
     ) -> Result<(Guard, Duration), CallError> {
+        self.try_create_session(caller, asked).inspect_err(|error| self.numbers.refused(error))
+    }
+
+    fn try_create_session(
+        self: &Arc<Self>,
+        caller: &Caller,
+        asked: &NewSession,
+    ) -> Result<(Guard, Duration), CallError> {
+        if self.shutdown.is_cancelled() {
+            return Err(CallError::ShuttingDown);
+        }
         let environment = self.registry.configure(&asked.env_id, &asked.options)?;
         let spec = environment.spec();
         let options = BatchOptions {

@@ -310,16 +310,24 @@ impl Interaction {
             work(&mut **guard, &request, &mut self.out)?;
             guard.show();
             self.last_used = Instant::now();
-            self.took = Some(self.last_used - begun);
+            let took = self.last_used - begun;
+            self.took = Some(took);
+            if let Request::Step(_) = request {
+                self.host.numbers.stepped(guard.options().num_envs, took);
+            }
         } else if !self.out.is_empty() {
             // The answers before it need not wait for it.
             self.waiting = Some(request);
         } else if let Some(mut guard) = self.held.take() {
-            let mut out = std::mem::take(&mut self.out);
+            let (mut out, host) = (std::mem::take(&mut self.out), Arc::clone(&self.host));
             self.phase = Phase::Working(tokio::task::spawn_blocking(move || {
                 let begun = Instant::now();
                 let outcome = work(&mut *guard, &request, &mut out);
-                (guard, out, outcome, begun.elapsed())
+                let took = begun.elapsed();
+                if let (Request::Step(_), Ok(())) = (&request, &outcome) {
+                    host.numbers.stepped(guard.options().num_envs, took);
+                }
+                (guard, out, outcome, took)
             }));
         }
         Ok(())

@@ -4,6 +4,7 @@ pub(crate) mod aside;
 mod from_proto;
 pub(crate) mod host;
 pub(crate) mod interact;
+mod numbers;
 mod reply;
 mod rules;
 mod serve;
@@ -13,6 +14,6 @@ mod to_proto;
 mod watch;
 mod workers;
 
-pub use serve::{ServeError, serve};
+pub use serve::{ServeError, serve, serve_observed, telemetry};
 pub use status::CallError;
 pub(crate) use status::with_details;

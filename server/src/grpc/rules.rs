@@ -11,9 +11,11 @@ const ACT: Need = Need::Scope(&[Scope::Act]);
 /// The rule of a path.
 pub fn rule(path: &str) -> Rule {
     match path.strip_prefix('/').and_then(|path| path.split_once('/')) {
-        Some(("mazeway.env.v1.EnvironmentService" | "dm_env_rpc.v1.Environment", method)) => {
-            Rule { need: ACT, streams: matches!(method, "Interact" | "Rollout" | "GetModel" | "Watch" | "Process") }
-        }
+        Some(
+            ("mazeway.env.v1.EnvironmentService", "Interact" | "Rollout" | "GetModel" | "Watch")
+            | ("dm_env_rpc.v1.Environment", "Process"),
+        ) => Rule::stream(ACT),
+        Some(("mazeway.env.v1.EnvironmentService" | "dm_env_rpc.v1.Environment", _)) => Rule::call(ACT),
         _ => Rule::call(Need::Token),
     }
 }

@@ -8,11 +8,13 @@ use mazeway_serving::{
     DoorError, Listener,
     connections::Gate,
     door::Door,
+    telemetry::Telemetry,
     transport::{Transport, Wire},
 };
 use std::{future::Future, io, sync::Arc};
 use tokio_util::sync::CancellationToken;
 use tonic::service::Routes;
+use tonic_health::ServingStatus;
 
 /// Bytes of a stream that may wait for their reader: some steps of the largest batch.
 const STREAM_WINDOW_BYTES: u32 = 1 << 20;
@@ -45,6 +47,24 @@ pub async fn serve(
     listener: impl Into<Listener>,
     shutdown: impl Future<Output = ()>,
 ) -> Result<(), ServeError> {
+    serve_observed(config, listener, Arc::new(telemetry()), shutdown).await
+}
+
+/// Numbers of an environment server.
+pub fn telemetry() -> Telemetry {
+    Telemetry::new("mazeway_server")
+}
+
+/// As [`serve`]; what happens is counted there.
+///
+/// # Errors
+/// As [`serve`].
+pub async fn serve_observed(
+    config: Config,
+    listener: impl Into<Listener>,
+    telemetry: Arc<Telemetry>,
+    shutdown: impl Future<Output = ()>,
+) -> Result<(), ServeError> {
     let stopping = CancellationToken::new();
     // Whatever way this ends, the reaper, the workers and the streams learn of it.
     let _stop = stopping.clone().drop_guard();
@@ -57,11 +77,11 @@ pub async fn serve(
             .register_encoded_file_descriptor_set(mazeway_proto::DM_ENV_RPC_FILE_DESCRIPTOR_SET)
             .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
     };
-    let gate = Gate::new(listener.into(), config.door.max_connections);
-    let door = Arc::new(Door::new(&config.door, rule)?);
+    let gate = Gate::new(listener.into(), config.door.max_connections, &telemetry);
+    let door = Arc::new(Door::new(&config.door, rule, &telemetry)?);
     let (wire, door_config) = (wire(&config), config.door.clone());
     let (threads, grace) = (config.threads(), config.shutdown_grace);
-    let host = Arc::new(Host::new(config, stopping.clone()));
+    let host = Arc::new(Host::new(config, &telemetry, stopping.clone()));
     let routes = Routes::new(Environments::new(&host))
         .add_service(dm_env::EnvironmentServer(Arc::clone(&host)))
         .add_service(health_service)
@@ -79,11 +99,14 @@ pub async fn serve(
             }
         }
     };
+    telemetry.set_serving(true);
     tokio::select! {
         () = hand_over => {}
         () = door.guard() => {}
         () = shutdown => {}
     }
+    telemetry.set_serving(false);
+    health.set_service_status("", ServingStatus::NotServing).await;
     health.set_not_serving::<EnvironmentServiceServer<EnvironmentGrpc>>().await;
     health.set_not_serving::<dm_env::EnvironmentServer>().await;
     // Nobody is let in any more, and a Unix socket is gone, before running calls are waited for.

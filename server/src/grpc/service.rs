@@ -9,13 +9,14 @@ use super::{
 };
 use crate::{
     raster::{Format, rasterise},
+    rollout::EpisodeChunk,
     sessions::{SessionError, SessionId},
 };
 use bytes::Bytes;
 use futures_util::{Stream, StreamExt as _, stream};
 use mazeway_proto::env::{self as pb, environment_service_server::EnvironmentService};
 use mazeway_serving::Caller;
-use std::{pin::Pin, sync::Arc};
+use std::{pin::Pin, sync::Arc, time::Instant};
 use tokio::sync::{mpsc, oneshot};
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Request, Response, Status, Streaming};
@@ -73,7 +74,13 @@ impl EnvironmentService for EnvironmentGrpc {
         let caller = Caller::of(&request);
         let request = request.into_inner();
         let guard = self.0.take(&caller, from_proto::session_id(&request.session_id)?)?;
-        let work = interact::run(guard, move |batch| Ok(to_proto::step(batch.step(&request.actions)?)));
+        let host = Arc::clone(&self.0);
+        let work = interact::run(guard, move |batch| {
+            let (num_envs, begun) = (batch.options().num_envs, Instant::now());
+            let answer = to_proto::step(batch.step(&request.actions)?);
+            host.numbers.stepped(num_envs, begun.elapsed());
+            Ok(answer)
+        });
         Ok(Response::new(work.await?))
     }
 
@@ -94,10 +101,14 @@ impl EnvironmentService for EnvironmentGrpc {
             CallError::Limit { field: "rollouts", what: "roll-outs at a time", limit, asked: limit + 1 }
         })?;
         let (sender, receiver) = mpsc::channel(WAITING_CHUNKS);
+        let host = Arc::clone(host);
         tokio::task::spawn_blocking(move || {
             let _permit = permit;
             // Sending waits for the reader and fails once it has gone.
-            let mut emit = |chunk| sender.blocking_send(Ok(to_proto::episodes(chunk))).is_ok();
+            let mut emit = |chunk: EpisodeChunk| {
+                host.numbers.rolled_out(chunk.lengths.iter().map(|&length| u64::from(length)).sum());
+                sender.blocking_send(Ok(to_proto::episodes(chunk))).is_ok()
+            };
             environment.roll_out(&plan, &|| sender.is_closed(), &mut emit);
         });
         Ok(Response::new(Box::pin(ReceiverStream::new(receiver))))

@@ -7,6 +7,7 @@
 use super::serve::ServeError;
 use mazeway_serving::{
     connections::{Counted, Load},
+    fair::Lane,
     listen::Accepted,
     transport::Transport,
 };
@@ -65,6 +66,8 @@ async fn serve(
     grace: Duration,
 ) {
     let connections = TaskTracker::new();
+    // Ends with the runtime.
+    tokio::spawn(Lane::open());
     loop {
         let arrived = tokio::select! {
             biased;

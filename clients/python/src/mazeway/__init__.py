@@ -36,7 +36,7 @@ from mazeway.errors import (
     UnsupportedError,
     WrongStateError,
 )
-from mazeway.fit import Fit, FitSummary, ModelSummary, Posterior, Progress
+from mazeway.fit import Fit, FitSummary, ModelSummary, Posterior, Progress, Queued
 from mazeway.learner import Learner
 from mazeway.model import Model
 from mazeway.recorder import Recorder
@@ -69,6 +69,7 @@ __all__ = [
     "NotFoundError",
     "Posterior",
     "Progress",
+    "Queued",
     "Recorder",
     "ResetNeededError",
     "Rollout",

@@ -38,6 +38,22 @@ class Progress:
 
 
 @dataclass(frozen=True)
+class Queued:
+    """The place of a fit that waits its turn; printed, "waiting: 3rd of 7"."""
+
+    #: From 1, the next to begin.
+    place: int
+    #: How many fits wait.
+    length: int
+
+    def __str__(self) -> str:
+        """As a person says it."""
+        teens = 11 <= self.place % 100 <= 13
+        ending = "th" if teens else {1: "st", 2: "nd", 3: "rd"}.get(self.place % 10, "th")
+        return f"waiting: {self.place}{ending} of {self.length}"
+
+
+@dataclass(frozen=True)
 class Posterior:
     """What the data leave open of the weights, each array of shape (n_basis,)."""
 

@@ -15,7 +15,7 @@ from mazeway._session import DEFAULT_TIMEOUT_SECS
 from mazeway._transport import connect
 from mazeway.env import server_env_id
 from mazeway.errors import InvalidArgumentError, ServerFailureError
-from mazeway.fit import Fit, FitSummary, ModelSummary, Progress, options_to_wire, stopped_name
+from mazeway.fit import Fit, FitSummary, ModelSummary, Progress, Queued, options_to_wire, stopped_name
 from mazeway.model import Model
 from mazeway.trajectory import Trajectory, timestamp
 
@@ -85,6 +85,7 @@ class Learner:
         source: str = "",
         trajectory_ids: Sequence[str] = (),
         progress: Callable[[Progress], None] | None = None,
+        queued: Callable[[Queued], None] | None = None,
         timeout_secs: float = 600.0,
         **options: Any,
     ) -> Fit:
@@ -99,6 +100,8 @@ class Learner:
             source: Only demonstrations by this source.
             trajectory_ids: Only these demonstrations.
             progress: Called after each iteration.
+            queued: Called when the place of a fit that waits its turn changes; `queued=print` prints
+                "waiting: 3rd of 7".
             timeout_secs: Longest time without a word from the learner; the fit itself may take longer.
             **options: discount, horizon, horizon_prior ("geometric", "uniform"), basis ("state",
                 "state-action", "features"), features (names), m_step ("nnls", "simplex"),
@@ -117,10 +120,13 @@ class Learner:
         )
         _assign(request, "max_trajectories", max_trajectories)
         for response in self._transport.responses("Fit", request, timeout=timeout_secs, each=True):
-            if response.WhichOneof("event") == "fit":
-                return Fit(response.fit)
-            if progress is not None:
-                progress(Progress.from_wire(response.progress))
+            match response.WhichOneof("event"):
+                case "fit":
+                    return Fit(response.fit)
+                case "progress" if progress is not None:
+                    progress(Progress.from_wire(response.progress))
+                case "queued" if queued is not None:
+                    queued(Queued(response.queued.place, response.queued.length))
         raise ServerFailureError(f"the learner at {self.address} ended the fit without a result")
 
     def show(self, fit_id: str) -> Fit:

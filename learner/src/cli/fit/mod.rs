@@ -161,8 +161,10 @@ async fn learn(
     };
     let spinner = narrator.spinner("fit");
     let fit = services
-        .fit(request, |progress| {
-            spinner.set_message(format!("iteration {}, objective {:.6}", progress.iteration, progress.objective));
+        .fit(request, |event| {
+            if let Some(message) = narrate::fit_event(event) {
+                spinner.set_message(message);
+            }
         })
         .await?;
     spinner.finish_and_clear();

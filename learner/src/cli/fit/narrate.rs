@@ -4,6 +4,7 @@
 //! where both it and standard output are terminals.
 
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use mazeway_proto::learner::{FitQueued, fit_response::Event};
 use std::{
     io::{self, IsTerminal, Write},
     time::Duration,
@@ -62,4 +63,39 @@ fn styled(bar: ProgressBar, what: &'static str, style: ProgressStyle) -> Progres
     bar.set_style(style);
     bar.set_prefix(what);
     bar
+}
+
+/// What a spinner says of a fit that waits or goes on.
+pub fn fit_event(event: &Event) -> Option<String> {
+    match event {
+        Event::Queued(FitQueued { place, length }) => Some(format!("waiting: {} of {length}", ordinal(*place))),
+        Event::Progress(progress) => {
+            Some(format!("iteration {}, objective {:.6}", progress.iteration, progress.objective))
+        }
+        Event::Fit(_) => None,
+    }
+}
+
+fn ordinal(number: u32) -> String {
+    let ending = match (number % 10, number % 100) {
+        (_, 11..=13) => "th",
+        (1, _) => "st",
+        (2, _) => "nd",
+        (3, _) => "rd",
+        _ => "th",
+    };
+    format!("{number}{ending}")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_place_in_the_queue_reads_as_one() {
+        let said = |place| fit_event(&Event::Queued(FitQueued { place, length: 200 })).expect("a message");
+        assert_eq!(said(3), "waiting: 3rd of 200");
+        let words = [1, 2, 4, 11, 12, 13, 21, 101, 111, 122].map(ordinal);
+        assert_eq!(words, ["1st", "2nd", "4th", "11th", "12th", "13th", "21st", "101st", "111th", "122nd"]);
+    }
 }

@@ -12,7 +12,7 @@ use mazeway_client::{
     Code, ConnectOptions, Connection, Env, EnvSpec, Episodes, Learner, Model, Rollout, SessionOptions, packed::Packed,
 };
 use mazeway_learner::report::Source;
-use mazeway_proto::learner::{Fit, FitProgress, FitRequest, Trajectory, TrajectoryFilter};
+use mazeway_proto::learner::{Fit, FitRequest, Trajectory, TrajectoryFilter, fit_response::Event};
 use std::path::{Path, PathBuf};
 
 /// Port of an environment server beside a learner service, where none is named.
@@ -208,8 +208,8 @@ impl Services {
     ///
     /// # Errors
     /// The learner refuses or fails.
-    pub async fn fit(&self, request: FitRequest, progress: impl FnMut(&FitProgress)) -> Result<Fit, CliError> {
-        self.learner.fit(request, progress).await.map_err(|error| match error.field() {
+    pub async fn fit(&self, request: FitRequest, follow: impl FnMut(&Event)) -> Result<Fit, CliError> {
+        self.learner.fit_following(request, follow).await.map_err(|error| match error.field() {
             Some(field) if field.starts_with("options") => {
                 CliError::usage(error.to_string(), "see 'learner fit --help' for what each option takes")
             }

@@ -1,0 +1,104 @@
+//! `soak`: holds a server under load for as long as one likes, and prints what was seen.
+//!
+//! `cargo run --release -p mazeway-bench-soak -- --minutes 60` builds the server in the same profile first. Linux alone: it
+//! looks into `/proc` and runs `chrt`, `taskset` and `kill`.
+
+use clap::{Args, Parser, Subcommand};
+use mazeway_bench_soak::{
+    load::{Kind, Share},
+    run::{Plan, run},
+};
+use std::{
+    path::PathBuf,
+    process::{Command, ExitCode},
+    time::Duration,
+};
+
+#[derive(Debug, Parser)]
+#[command(about = "Holds a server under the load of two thousand sessions", args_conflicts_with_subcommands = true)]
+struct Cli {
+    #[command(subcommand)]
+    part: Option<Part>,
+    #[command(flatten)]
+    run: RunArgs,
+}
+
+#[derive(Debug, Args)]
+struct RunArgs {
+    /// How long the load lasts.
+    #[arg(long, default_value_t = 5.0, value_name = "N")]
+    minutes: f64,
+    /// The server on the first core, all else on the second: as if on two machines.
+    #[arg(long)]
+    pinned: bool,
+    /// Print one JSON object instead of tables.
+    #[arg(long)]
+    json: bool,
+    /// The binary `server`; built from the present sources where it is not given.
+    #[arg(long, value_name = "FILE")]
+    server: Option<PathBuf>,
+}
+
+#[derive(Debug, Subcommand)]
+enum Part {
+    /// A process of the load
+    #[command(hide = true)]
+    Load(LoadArgs),
+}
+
+#[derive(Debug, Args)]
+struct LoadArgs {
+    #[arg(long)]
+    address: String,
+    #[arg(long, value_enum)]
+    kind: Kind,
+    #[arg(long)]
+    connections: usize,
+    #[arg(long)]
+    sessions: usize,
+    #[arg(long)]
+    lease_secs: u64,
+}
+
+fn main() -> ExitCode {
+    let cli = Cli::parse();
+    if let Some(Part::Load(LoadArgs { address, kind, connections, sessions, lease_secs })) = cli.part {
+        let share = Share { kind, connections, sessions, lease: Duration::from_secs(lease_secs) };
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().expect("a runtime");
+        runtime.block_on(share.run(address));
+        return ExitCode::SUCCESS;
+    }
+    let RunArgs { minutes, pinned, json, server } = cli.run;
+    let time = Duration::try_from_secs_f64(minutes * 60.0).unwrap_or(Duration::from_mins(5));
+    let soak = std::env::current_exe().expect("a path of this program");
+    let plan = Plan { server: server.unwrap_or_else(build_server), soak, time, pinned };
+    match run(&plan) {
+        Ok(report) => {
+            if json {
+                println!("{}", report.to_json());
+            } else {
+                print!("{}", report.tables());
+            }
+            ExitCode::SUCCESS
+        }
+        Err(error) => {
+            eprintln!("error: {error}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+/// The server in the profile of this program.
+fn build_server() -> PathBuf {
+    let own = std::env::current_exe().expect("a path of this program");
+    let directory = own.ancestors().nth(1).expect("a profile's directory");
+    let profile = match directory.file_name().and_then(|name| name.to_str()) {
+        Some("debug") | None => "dev",
+        Some(name) => name,
+    };
+    let mut cargo = Command::new(std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
+    cargo.args(["build", "--quiet", "-p", "mazeway-server", "--bin", "server", "--profile", profile]);
+    let status = cargo.current_dir(env!("CARGO_MANIFEST_DIR")).status().expect("cargo");
+    assert!(status.success(), "{cargo:?}: {status}");
+    directory.join(format!("server{}", std::env::consts::EXE_SUFFIX))
+}

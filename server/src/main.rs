@@ -17,6 +17,11 @@ use std::{
     sync::Arc,
 };
 
+/// Gives memory back once a load has gone; the system's allocator keeps what connections took at their most.
+#[cfg(target_os = "linux")]
+#[global_allocator]
+static ALLOCATOR: tikv_jemallocator::Jemalloc = tikv_jemallocator::Jemalloc;
+
 fn main() -> ExitCode {
     let parsed = settings::parse(Cli::command(), VARIABLES, &PLACES, env::args_os());
     let (cli, settings) = match parsed.and_then(|settings| Ok((settings.typed::<Cli>()?, settings))) {

@@ -2,30 +2,35 @@
 //! others ask.
 //!
 //! A worker serves its connections on one thread, in the order in which their bytes came. Where a hundred send as fast as
-//! they can, whoever sends a single request waits for a hundred others. So each connection has an allowance of reads that
-//! grows with time ([`READS_A_SECOND`], up to [`SAVED_READS`]). Within it, bytes are read as they come. Beyond it, a
-//! connection waits in the worker's lane, which lets them read in turn, one at a time, and each time only after the worker
-//! has nothing else to do and has asked the operating system for what came meanwhile.
+//! they can, whoever sends a single request waits for a hundred others. So each connection is charged for what it sends,
+//! against a virtual time that grows by an even share of all that is sent to the worker (start-time fair queueing: Goyal,
+//! Vin and Cheng, 1996). One that has asked for no more than its share reads its bytes as they come. One that is ahead of
+//! it waits in the worker's lane, which lets them read one at a time, those first that have asked least, and each time only
+//! after the worker has nothing else to do and has asked the operating system for what came meanwhile.
 //!
-//! Invariants: a connection that has the worker to itself never waits; one with bytes to read that waits is in the lane
-//! exactly once, and gets its turn after one of each other at most; nothing here is shared between workers.
+//! Invariants: a connection that has the worker to itself never waits and takes no lock; one with bytes to read that waits is
+//! in the lane exactly once; what one may save up or owe is bounded, so that nobody waits for ever; nothing here is shared
+//! between workers, and nothing asks a clock.
 
 use std::{
     cell::RefCell,
-    collections::VecDeque,
+    collections::BTreeMap,
     sync::{
         Arc, Mutex, MutexGuard, PoisonError,
-        atomic::{AtomicBool, AtomicU64, Ordering::Relaxed},
+        atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering::Relaxed},
     },
     task::{Context, Poll, Waker},
-    time::Instant,
 };
 use tokio::sync::Notify;
 
-/// Reads that a connection may do at any time, on the average.
-const READS_A_SECOND: f64 = 1000.0;
-/// Reads that a connection saves up while it is quiet.
-const SAVED_READS: u32 = 100;
+/// Virtual time that a byte takes.
+const BYTE: u64 = 1024;
+/// What a read is charged beyond its bytes, in bytes: about a request.
+const READ_BYTES: u64 = 16;
+/// What a connection saves up while it is quiet.
+const SAVED: u64 = BYTE << 10;
+/// What a connection owes at most: beyond it, those that ask much take turns.
+const OWED: u64 = BYTE << 14;
 
 thread_local! {
     static LANE: RefCell<Option<Arc<Lane>>> = const { RefCell::new(None) };
@@ -34,41 +39,39 @@ thread_local! {
 /// One that waits for its turn.
 #[derive(Debug)]
 struct Waiting {
-    id: u64,
     granted: Arc<AtomicBool>,
     waker: Waker,
 }
 
-#[derive(Debug, Default)]
-struct State {
-    waiting: VecDeque<Waiting>,
-    /// Who had the last turn.
-    last: u64,
-}
+/// What a place in the lane is ordered by: what has been asked for, then who came first.
+type Place = (u64, u64);
 
-/// Where the connections of a worker wait that have asked much.
+/// Where the connections of a worker wait that have asked much. The atomics are read and written by the worker alone.
 #[derive(Debug, Default)]
 pub struct Lane {
-    state: Mutex<State>,
+    now: AtomicU64,
+    connections: AtomicU64,
+    /// Who had the last turn.
+    last: AtomicU64,
+    waits: AtomicUsize,
+    arrivals: AtomicU64,
+    waiting: Mutex<BTreeMap<Place, Waiting>>,
     came: Notify,
 }
 
 impl Lane {
-    fn lock(&self) -> MutexGuard<'_, State> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
     /// Makes a lane for the connections that this thread serves from now on. What is returned gives out the turns; it is to
     /// be run on this thread.
     pub fn open() -> impl Future<Output = ()> {
         let lane = Arc::<Self>::default();
+        // Nobody has saved anything at the beginning of time.
+        lane.now.store(SAVED, Relaxed);
         LANE.with(|present| present.replace(Some(Arc::clone(&lane))));
         async move {
             loop {
-                let next = lane.lock().waiting.pop_front();
+                let next = lane.change(BTreeMap::pop_first);
                 match next {
-                    Some(Waiting { id, granted, waker }) => {
-                        lane.lock().last = id;
+                    Some((_, Waiting { granted, waker })) => {
                         granted.store(true, Relaxed);
                         waker.wake();
                         // Comes back when all that was ready has run and new bytes have been asked for.
@@ -79,6 +82,18 @@ impl Lane {
             }
         }
     }
+
+    fn change<T>(&self, change: impl FnOnce(&mut BTreeMap<Place, Waiting>) -> T) -> T {
+        let mut waiting: MutexGuard<'_, _> = self.waiting.lock().unwrap_or_else(PoisonError::into_inner);
+        let outcome = change(&mut waiting);
+        self.waits.store(waiting.len(), Relaxed);
+        outcome
+    }
+
+    fn enter(&self, place: Place, waiting: Waiting) {
+        self.change(|all| all.insert(place, waiting));
+        self.came.notify_one();
+    }
 }
 
 /// A connection's right to read.
@@ -86,10 +101,10 @@ impl Lane {
 pub struct Pass {
     lane: Arc<Lane>,
     id: u64,
-    reads: u32,
-    since: Instant,
+    /// The virtual time until which it has had its share.
+    until: u64,
     granted: Arc<AtomicBool>,
-    waits: bool,
+    place: Option<Place>,
 }
 
 impl Pass {
@@ -97,14 +112,9 @@ impl Pass {
     pub fn of_thread() -> Option<Self> {
         static NEXT: AtomicU64 = AtomicU64::new(1);
         let lane = LANE.with(|present| present.borrow().clone())?;
-        Some(Self {
-            lane,
-            id: NEXT.fetch_add(1, Relaxed),
-            reads: SAVED_READS,
-            since: Instant::now(),
-            granted: Arc::default(),
-            waits: false,
-        })
+        lane.connections.fetch_add(1, Relaxed);
+        let (id, until) = (NEXT.fetch_add(1, Relaxed), lane.now.load(Relaxed) - SAVED);
+        Some(Self { lane, id, until, granted: Arc::default(), place: None })
     }
 
     /// Whether the connection may read now. Asked anew when its waker is woken. `has_bytes` says whether there is anything
@@ -114,54 +124,46 @@ impl Pass {
         cx: &mut Context<'_>,
         has_bytes: impl FnOnce(&mut Context<'_>) -> Poll<()>,
     ) -> Poll<()> {
-        if self.reads > 0 || self.granted.load(Relaxed) {
-            return Poll::Ready(());
-        }
-        let saved = (self.since.elapsed().as_secs_f64() * READS_A_SECOND) as u32;
-        if saved > 0 {
-            self.reads = saved.min(SAVED_READS);
-            self.since = Instant::now();
+        let lane = &self.lane;
+        let nobody_since = || lane.waits.load(Relaxed) == 0 && lane.last.load(Relaxed) == self.id;
+        if self.until <= lane.now.load(Relaxed) || self.granted.load(Relaxed) || nobody_since() {
             return Poll::Ready(());
         }
         if has_bytes(cx).is_pending() {
             return Poll::Pending;
         }
-        let mut state = self.lane.lock();
-        if self.waits {
-            if let Some(place) = state.waiting.iter_mut().find(|waiting| waiting.id == self.id) {
-                place.waker.clone_from(cx.waker());
-                return Poll::Pending;
-            }
-        } else if state.waiting.is_empty() && state.last == self.id {
-            // Nobody has had a turn since.
-            return Poll::Ready(());
-        }
-        self.waits = true;
-        let (granted, waker) = (Arc::clone(&self.granted), cx.waker().clone());
-        state.waiting.push_back(Waiting { id: self.id, granted, waker });
-        drop(state);
-        self.lane.came.notify_one();
+        let place = *self.place.get_or_insert_with(|| (self.until, lane.arrivals.fetch_add(1, Relaxed)));
+        // A second time it is the same place, with the waker of now.
+        lane.enter(place, Waiting { granted: Arc::clone(&self.granted), waker: cx.waker().clone() });
         Poll::Pending
     }
 
-    /// It has read.
-    pub fn used(&mut self) {
-        if self.reads > 0 {
-            self.reads -= 1;
-            if self.reads == 0 {
-                self.since = Instant::now();
-            }
-        } else {
-            self.waits = false;
+    /// True where it may read since it is its turn, and others may wait for theirs.
+    pub fn is_turn(&self) -> bool {
+        self.place.is_some()
+    }
+
+    /// It has read so many bytes.
+    pub fn used(&mut self, bytes: usize) {
+        let lane = &self.lane;
+        if let Some(place) = self.place.take() {
+            // Time may have gone by so far that it needed no turn.
+            lane.change(|all| all.remove(&place));
+            lane.last.store(self.id, Relaxed);
             self.granted.store(false, Relaxed);
         }
+        let cost = (bytes as u64 + READ_BYTES) * BYTE;
+        let now = lane.now.load(Relaxed) + cost / lane.connections.load(Relaxed).max(1);
+        lane.now.store(now, Relaxed);
+        self.until = self.until.max(now - SAVED).saturating_add(cost).min(now + OWED);
     }
 }
 
 impl Drop for Pass {
     fn drop(&mut self) {
-        if self.waits {
-            self.lane.lock().waiting.retain(|waiting| waiting.id != self.id);
+        self.lane.connections.fetch_sub(1, Relaxed);
+        if let Some(place) = self.place {
+            self.lane.change(|all| all.remove(&place));
         }
     }
 }
@@ -170,7 +172,7 @@ impl Drop for Pass {
 mod tests {
     use super::*;
     use crate::listen::Accepted;
-    use std::time::Duration;
+    use std::time::{Duration, Instant};
     use tokio::{
         io::{AsyncReadExt as _, AsyncWriteExt as _},
         net::{TcpListener, TcpStream},
@@ -233,7 +235,7 @@ mod tests {
                     while greedy.write_all(&ahead).await.is_ok() && greedy.read_exact(&mut answers).await.is_ok() {}
                 });
             }
-            tokio::time::sleep(Duration::from_millis(500)).await;
+            tokio::time::sleep(Duration::from_secs(1)).await;
             let mut waits = Vec::new();
             for _ in 0..100 {
                 let before = done.load(Relaxed);

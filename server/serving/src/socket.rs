@@ -9,10 +9,13 @@ use std::{
 #[cfg(unix)]
 use tokio::net::UnixStream;
 use tokio::{
-    io::{AsyncRead, AsyncWrite, ReadBuf},
+    io::{AsyncRead, AsyncReadExt as _, AsyncWrite, ReadBuf, Take},
     net::TcpStream,
 };
 use tokio_util::either::Either;
+
+/// Bytes that a connection reads in a turn: some hundred steps that were sent ahead take that long.
+const TURN_BYTES: u64 = 4 << 10;
 
 /// A stream of either kind.
 #[cfg(unix)]
@@ -24,7 +27,7 @@ type Stream = Either<TcpStream, TcpStream>;
 /// A connection of either kind.
 #[derive(Debug)]
 pub struct Socket {
-    stream: Stream,
+    stream: Take<Stream>,
     pass: Option<Pass>,
     numbers: Connections,
 }
@@ -32,26 +35,32 @@ pub struct Socket {
 impl Socket {
     /// A connection of the present thread, whose bytes are counted.
     pub(crate) fn new(stream: Stream, numbers: Connections) -> Self {
-        Self { stream, pass: Pass::of_thread(), numbers }
+        Self { stream: stream.take(0), pass: Pass::of_thread(), numbers }
     }
 }
 
 impl AsyncRead for Socket {
     fn poll_read(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buf: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
         let Self { stream, pass, numbers } = &mut *self;
+        let mut limit = u64::MAX;
         if let Some(pass) = pass {
             // An error is something to read.
-            ready!(pass.poll_turn(cx, |cx| match stream {
+            ready!(pass.poll_turn(cx, |cx| match stream.get_ref() {
                 Either::Left(stream) => stream.poll_read_ready(cx).map(drop),
                 Either::Right(stream) => stream.poll_read_ready(cx).map(drop),
             }));
+            if pass.is_turn() {
+                limit = TURN_BYTES;
+            }
         }
+        stream.set_limit(limit);
         let before = buf.filled().len();
         let read = ready!(Pin::new(stream).poll_read(cx, buf));
+        let bytes = buf.filled().len() - before;
         if let Some(pass) = pass {
-            pass.used();
+            pass.used(bytes);
         }
-        numbers.received.add((buf.filled().len() - before) as u64);
+        numbers.received.add(bytes as u64);
         Poll::Ready(read)
     }
 }
@@ -67,16 +76,16 @@ impl Socket {
 
 impl AsyncWrite for Socket {
     fn poll_write(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buf: &[u8]) -> Poll<io::Result<usize>> {
-        let written = Pin::new(&mut self.stream).poll_write(cx, buf);
+        let written = Pin::new(self.stream.get_mut()).poll_write(cx, buf);
         self.sent(written)
     }
 
     fn poll_flush(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
-        Pin::new(&mut self.stream).poll_flush(cx)
+        Pin::new(self.stream.get_mut()).poll_flush(cx)
     }
 
     fn poll_shutdown(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
-        Pin::new(&mut self.stream).poll_shutdown(cx)
+        Pin::new(self.stream.get_mut()).poll_shutdown(cx)
     }
 
     fn poll_write_vectored(
@@ -84,11 +93,11 @@ impl AsyncWrite for Socket {
         cx: &mut Context<'_>,
         bufs: &[io::IoSlice<'_>],
     ) -> Poll<io::Result<usize>> {
-        let written = Pin::new(&mut self.stream).poll_write_vectored(cx, bufs);
+        let written = Pin::new(self.stream.get_mut()).poll_write_vectored(cx, bufs);
         self.sent(written)
     }
 
     fn is_write_vectored(&self) -> bool {
-        self.stream.is_write_vectored()
+        self.stream.get_ref().is_write_vectored()
     }
 }

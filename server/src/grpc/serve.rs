@@ -16,8 +16,9 @@ use tokio_util::sync::CancellationToken;
 use tonic::service::Routes;
 use tonic_health::ServingStatus;
 
-/// Bytes of a stream that may wait for their reader: some steps of the largest batch.
-const STREAM_WINDOW_BYTES: u32 = 1 << 20;
+/// Bytes of a stream that may wait to be read: a step of the largest batch. A client that sends ahead and reads no answers
+/// costs so much and no more.
+const STREAM_WINDOW_BYTES: u32 = 256 << 10;
 /// Bytes of all streams of a connection that may wait: so many that a few blocked streams do not hold up the others.
 const CONNECTION_WINDOW_BYTES: u32 = 16 << 20;
 /// Largest frame taken in: a batch of actions comes in one.

@@ -7,6 +7,6 @@
 //! The load runs in processes of its own under the idle policy of the scheduler, for it stands for other machines.
 
 pub mod load;
-mod probe;
+pub mod probe;
 pub mod run;
 mod server;

@@ -88,7 +88,10 @@ async fn idle(mut env: Env, lease: Duration) {
     env.reset(Some(1)).await.expect("resets");
     loop {
         sleep(lease / 3).await;
-        env.step(0).await.expect("steps");
+        // On a machine that is too busy to let it act in time the lease runs out.
+        if env.step(0).await.is_err() {
+            return;
+        }
     }
 }
 

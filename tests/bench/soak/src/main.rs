@@ -44,6 +44,9 @@ enum Part {
     /// A process of the load
     #[command(hide = true)]
     Load(LoadArgs),
+    /// A process that sends back what it gets
+    #[command(hide = true)]
+    Echo,
 }
 
 #[derive(Debug, Args)]
@@ -62,10 +65,15 @@ struct LoadArgs {
 
 fn main() -> ExitCode {
     let cli = Cli::parse();
-    if let Some(Part::Load(LoadArgs { address, kind, connections, sessions, lease_secs })) = cli.part {
-        let share = Share { kind, connections, sessions, lease: Duration::from_secs(lease_secs) };
+    if let Some(part) = cli.part {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().expect("a runtime");
-        runtime.block_on(share.run(address));
+        match part {
+            Part::Load(LoadArgs { address, kind, connections, sessions, lease_secs }) => {
+                let share = Share { kind, connections, sessions, lease: Duration::from_secs(lease_secs) };
+                runtime.block_on(share.run(address));
+            }
+            Part::Echo => runtime.block_on(mazeway_bench_soak::probe::echo_back()).expect("a port"),
+        }
         return ExitCode::SUCCESS;
     }
     let RunArgs { minutes, pinned, json, server } = cli.run;

@@ -3,8 +3,9 @@
 use crate::{
     load::{Kind, Process, Share},
     probe::{self, Waits},
-    server::{Server, Taken},
+    server::{Echo, Server, Taken},
 };
+use rustix::thread::{CpuSet, sched_setaffinity};
 use serde_json::{Value, json};
 use std::{
     fmt::Write as _,
@@ -42,6 +43,7 @@ pub struct Plan {
 /// What was seen.
 #[derive(Debug, Clone)]
 pub struct Report {
+    bare: Waits,
     unloaded: Waits,
     loaded: Waits,
     fresh: Taken,
@@ -86,7 +88,7 @@ impl Report {
         let taken = |taken: &Taken| json!({"resident_bytes": taken.resident, "files": taken.files});
         json!({
             "benchmark": "soak", "pinned": self.pinned, "load_secs": self.load_secs, "sessions": self.sessions,
-            "unloaded": waits(&self.unloaded), "loaded": waits(&self.loaded), "ratio": self.ratio(),
+            "bare": waits(&self.bare), "unloaded": waits(&self.unloaded), "loaded": waits(&self.loaded), "ratio": self.ratio(),
             "steps_a_second": self.steps_a_second, "busy_cores": self.busy, "expired": self.expired,
             "fresh": taken(&self.fresh), "before": taken(&self.before), "peak": taken(&self.peak),
             "after": taken(&self.after), "bytes_a_session": self.bytes_a_session(),
@@ -101,7 +103,9 @@ impl Report {
             "{:<28}{:>10}{:>10}{:>10}{:>10}{:>10}",
             "step, µs", "steps", "median", "p99", "p99.9", "most"
         );
-        for (name, waits) in [("without load", &self.unloaded), ("under load", &self.loaded)] {
+        for (name, waits) in
+            [("bare socket, without load", &self.bare), ("without load", &self.unloaded), ("under load", &self.loaded)]
+        {
             let Waits { steps, median, p99, p999, most } = waits;
             let _ = writeln!(text, "{name:<28}{steps:>10}{median:>10.0}{p99:>10.0}{p999:>10.0}{most:>10.0}");
         }
@@ -191,6 +195,15 @@ pub fn run(plan: &Plan) -> io::Result<Report> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
     let server = Server::start(&plan.server, plan.pinned)?;
     let quiet = plan.time.clamp(Duration::from_secs(2), Duration::from_secs(20));
+    if plan.pinned {
+        let mut second = CpuSet::new();
+        second.set(1);
+        sched_setaffinity(None, &second)?;
+    }
+    let bare = {
+        let echo = Echo::start(&plan.soak, plan.pinned)?;
+        runtime.block_on(probe::echo(&echo.address, quiet))?
+    };
     let unloaded = runtime.block_on(probe::act(&server.address, quiet, || ()));
     let fresh = settled(&server)?;
     {
@@ -224,6 +237,7 @@ pub fn run(plan: &Plan) -> io::Result<Report> {
     let expired = server.number("mazeway_server_sessions_expired_total")?;
     let pinned = plan.pinned;
     Ok(Report {
+        bare,
         unloaded,
         loaded,
         fresh,

@@ -16,6 +16,38 @@ pub struct Server {
     metrics: String,
 }
 
+/// A process that sends back what it gets, on the first core alone where it is `pinned`; killed when it is dropped.
+#[derive(Debug)]
+pub struct Echo {
+    child: Child,
+    pub address: String,
+}
+
+impl Echo {
+    pub fn start(soak: &Path, pinned: bool) -> io::Result<Self> {
+        let mut command = on_first_core(soak, pinned);
+        let mut child = command.arg("echo").stdin(Stdio::null()).stdout(Stdio::piped()).spawn()?;
+        let mut address = String::new();
+        BufReader::new(child.stdout.take().ok_or(io::ErrorKind::BrokenPipe)?).read_line(&mut address)?;
+        Ok(Self { child, address: address.trim().to_owned() })
+    }
+}
+
+impl Drop for Echo {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+fn on_first_core(program: &Path, pinned: bool) -> Command {
+    let mut command = Command::new(if pinned { Path::new("taskset") } else { program });
+    if pinned {
+        command.args(["-c", "0"]).arg(program);
+    }
+    command
+}
+
 /// What a server takes of the machine.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Taken {
@@ -28,9 +60,9 @@ pub struct Taken {
 impl Server {
     /// Starts the binary `server`, on the first core alone where it is `pinned`.
     pub fn start(binary: &Path, pinned: bool) -> io::Result<Self> {
-        let mut command = Command::new(if pinned { Path::new("taskset") } else { binary });
+        let mut command = on_first_core(binary, pinned);
         if pinned {
-            command.args(["-c", "0"]).arg(binary).args(["--threads", "1"]);
+            command.args(["--threads", "1"]);
         }
         command.args(["--listen", "127.0.0.1:0", "--metrics-listen", "127.0.0.1:0", "--max-sessions", "4096"]);
         command.args(["--keepalive-secs", "2"]);

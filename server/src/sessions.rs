@@ -329,8 +329,8 @@ impl Sessions {
         Ok(Guard { sessions: Arc::clone(self), id, lease, sight, batch: Some(batch) })
     }
 
-    /// Leaves a wish to see a session, for somebody who may ([`Self::render_fps`] says so), granted at once where nobody has taken it, else by its taker. Looking is no use of it:
-    /// its lease runs on.
+    /// Leaves a wish to see a session, for somebody who may ([`Self::render_fps`] says so). It is granted at once where nobody
+    /// has taken the session, else by its taker. Looking is no use of it: its lease runs on.
     ///
     /// # Errors
     /// Unknown or expired.

@@ -1,15 +1,18 @@
 //! The learner service over real sockets: what it answers to right and to wrong calls.
 
 use mazeway_client::{
-    ClientError, Code, Demonstration, Learner, Model, Options, Recorder, packed::Packed, packed::pack,
+    ClientError, Code, ConnectOptions, Demonstration, Learner, Model, Options, Recorder, Token, packed::Packed,
+    packed::pack,
 };
-use mazeway_learner::config::Limits;
+use mazeway_learner::{Config, config::Limits};
 use mazeway_proto::{
     env::{ModelPart, model_part::Part},
     learner::{self as pb, fit_response::Event, learner_service_client::LearnerServiceClient},
 };
+use mazeway_serving::grant::{Quotas, Scope};
 use mazeway_tests::{
     EnvServer,
+    authority::Authority,
     learner::{LearnerServer, export, trajectory},
 };
 use serde_json::Value;
@@ -119,6 +122,12 @@ fn demonstrations(model_id: &str) -> Vec<Demonstration> {
 /// A learner that knows the maze and its demonstrations.
 async fn with_demonstrations(server: &LearnerServer) -> (Learner, Model) {
     let learner = server.client().await;
+    let model = demonstrate(&learner).await;
+    (learner, model)
+}
+
+/// Records twenty demonstrations of a maze.
+async fn demonstrate(learner: &Learner) -> Model {
     let model = maze().await;
     learner.put_model(&model).await.expect("a model");
     let mut recorder = learner.recorder();
@@ -127,7 +136,7 @@ async fn with_demonstrations(server: &LearnerServer) -> (Learner, Model) {
     }
     let receipt = recorder.finish().await.expect("everything stored");
     assert_eq!((receipt.stored, receipt.duplicates), (20, 0));
-    (learner, model)
+    model
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -611,6 +620,55 @@ async fn a_hundred_fits_wait_their_turn_and_nothing_else_does() {
         }
     }
     assert_eq!(learner.list_fits("", "").await.expect("fits").len(), 99);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn callers_take_turns_at_fits_and_each_has_its_quota() {
+    let authority = Authority::new();
+    let scopes = [Scope::Record, Scope::Fit];
+    let alice = authority.token("alice", &scopes, &Quotas::default());
+    let bob = authority.token("bob", &scopes, &Quotas { max_fits: Some(1), ..Quotas::default() });
+    let data = tempfile::tempdir().expect("a directory");
+    let limits = Limits { max_concurrent_fits: 1, ..Limits::default() };
+    let config = Config { door: authority.tokens(), limits, ..Config::new(data.path()) };
+    let server = LearnerServer::configured("127.0.0.1:0".parse().expect("an address"), config);
+    let known_by = async |secret: &str| {
+        let token = Some(Token::new(secret).expect("a token"));
+        let options = ConnectOptions { token, ..ConnectOptions::default() };
+        Learner::connect_with(&server.address(), &options).await.expect("a learner that knows it")
+    };
+    let (alice, bob) = (known_by(&alice).await, known_by(&bob).await);
+    demonstrate(&alice).await;
+    let endless = endless(&alice).await;
+    let quick = pb::FitRequest {
+        method: "bc".into(),
+        filter: Some(pb::TrajectoryFilter { style: "goals".into(), ..Default::default() }),
+        ..Default::default()
+    };
+    let mut running = alice.fit_stream(endless).await.expect("a stream");
+    timeout(PATIENCE, running.next()).await.expect("it runs").expect("progress");
+    let mut waiting = Vec::new();
+    for _ in 0..50 {
+        waiting.push(alice.fit_stream(quick.clone()).await.expect("a place in the queue"));
+    }
+    // Fifty of another came before, and but one of them goes before it.
+    let mut late = bob.fit_stream(quick.clone()).await.expect("a place in the queue");
+    let place = timeout(PATIENCE, late.next()).await.expect("a place").expect("a place");
+    let Some(Event::Queued(pb::FitQueued { place, length: 51 })) = place else {
+        panic!("expected a place, got {place:?}")
+    };
+    assert!(place <= 2, "place {place}");
+    let error = bob.fit_stream(quick.clone()).await.expect_err("more than it may");
+    assert_eq!((error.code(), error.field()), (Code::ResourceExhausted, Some("max_fits")), "{error}");
+    drop(running);
+    loop {
+        match timeout(PATIENCE, late.next()).await.expect("its turn").expect("a fit") {
+            Some(Event::Fit(_)) => break,
+            Some(_) => {}
+            None => panic!("the stream of a fit ended without a fit"),
+        }
+    }
+    bob.fit(quick, |_| ()).await.expect("there is room again");
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -117,12 +117,14 @@ impl FitQueue {
 }
 
 fn no_place(full: Full) -> CallError {
-    let (what, limit) = match full {
-        Full::Queue { limit } => ("fits that wait their turn", limit),
-        Full::Share { waiting } => ("fits of one caller that wait their turn, now that the queue is so long", waiting),
-        Full::Quota { limit } => ("fits of this caller at a time, those that wait included", limit),
+    let (field, what, limit) = match full {
+        Full::Queue { limit } => ("method", "fits that wait their turn", limit),
+        Full::Share { waiting } => {
+            ("method", "fits of one caller that wait their turn, now that the queue is so long", waiting)
+        }
+        Full::Quota { limit } => ("max_fits", "fits of this caller at a time, those that wait included", limit),
     };
-    CallError::Limit { field: "method".into(), what, limit: limit as u64, got: limit as u64 + 1 }
+    CallError::Limit { field: field.into(), what, limit: limit as u64, got: limit as u64 + 1 }
 }
 
 /// Waits for the turn and tells where it is.

@@ -201,9 +201,9 @@ mod tests {
     fn others_before_a_rare_one(fair: bool) -> (u64, u64) {
         let listener = std::net::TcpListener::bind("127.0.0.1:0").expect("a port");
         let address = listener.local_addr().expect("an address");
-        let done = Arc::new(AtomicU64::new(0));
+        let (done, over) = (Arc::new(AtomicU64::new(0)), Arc::new(AtomicBool::new(false)));
         let worker = std::thread::spawn({
-            let done = Arc::clone(&done);
+            let (done, over) = (Arc::clone(&done), Arc::clone(&over));
             move || {
                 let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().expect("a runtime");
                 runtime.block_on(async move {
@@ -217,8 +217,9 @@ mod tests {
                         stream.set_nodelay(true).expect("an option");
                         tokio::spawn(serve(stream.into_std().expect("a stream").into(), Arc::clone(&done)));
                     }
-                    // Told to end by the last connection that goes.
-                    tokio::time::sleep(Duration::from_secs(3)).await;
+                    while !over.load(Relaxed) {
+                        tokio::time::sleep(Duration::from_millis(10)).await;
+                    }
                 });
             }
         });
@@ -246,6 +247,7 @@ mod tests {
             }
             waits
         });
+        over.store(true, Relaxed);
         drop(runtime);
         worker.join().expect("a worker that ends well");
         waits.sort_unstable();

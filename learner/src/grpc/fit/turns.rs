@@ -49,8 +49,8 @@ struct Part {
     /// Keys of what waits, in order.
     waiting: Vec<Key>,
     running: usize,
-    /// Round of its latest.
-    last: u64,
+    /// Round that its next goes into, if that is not past by then.
+    next: u64,
 }
 
 /// Those that wait, and how many run.
@@ -74,9 +74,9 @@ impl<T> Turns<T> {
     /// is how many the caller may have, waiting and running.
     pub fn join(&mut self, caller: &Caller, quota: Option<usize>, idle: usize, work: T) -> Result<Ticket, Full> {
         let total = self.waiting.len();
-        let (waiting, running, last) = match self.callers.get(caller) {
-            Some(part) => (part.waiting.len(), part.running, Some(part.last)),
-            None => (0, 0, None),
+        let (waiting, running, next) = match self.callers.get(caller) {
+            Some(part) => (part.waiting.len(), part.running, part.next),
+            None => (0, 0, 0),
         };
         if let Some(limit) = quota.filter(|&limit| waiting + running >= limit) {
             return Err(Full::Quota { limit });
@@ -91,12 +91,12 @@ impl<T> Turns<T> {
                 return Err(Full::Share { waiting });
             }
         }
-        let round = last.map_or(self.round, |last| self.round.max(last + 1));
+        let round = self.round.max(next);
         let key = (round, self.next);
         self.next += 1;
         let part = self.callers.entry(caller.clone()).or_default();
         part.waiting.push(key);
-        part.last = round;
+        part.next = round + 1;
         self.waiting.insert(key, Waiting { caller: caller.clone(), work });
         Ok(key.1)
     }
@@ -117,7 +117,7 @@ impl<T> Turns<T> {
         if let Some(part) = self.callers.get_mut(caller) {
             part.running = part.running.saturating_sub(1);
         }
-        self.forget(caller);
+        self.forget();
     }
 
     /// Gives up a place; true where it was one and not running yet.
@@ -133,17 +133,16 @@ impl<T> Turns<T> {
             }
             freed = std::mem::replace(key, moved);
         }
-        part.last = freed.0.saturating_sub(1).max(part.waiting.last().map_or(0, |key| key.0));
-        self.forget(caller);
+        part.next = freed.0;
+        self.forget();
         true
     }
 
-    /// A caller that has nothing left and whose rounds are past is as good as a new one.
-    fn forget(&mut self, caller: &Caller) {
-        let gone = |part: &Part| part.waiting.is_empty() && part.running == 0;
-        if self.callers.get(caller).is_some_and(gone) {
-            self.callers.remove(caller);
-        }
+    /// A caller that has nothing left and whose rounds are past is as good as a new one; where nobody waits all rounds are.
+    fn forget(&mut self) {
+        let (nobody_waits, round) = (self.waiting.is_empty(), self.round);
+        self.callers
+            .retain(|_, part| !part.waiting.is_empty() || part.running > 0 || (part.next > round && !nobody_waits));
     }
 
     /// How many wait.
@@ -207,6 +206,22 @@ mod tests {
         join(&mut turns, "b", 1);
         let first: Vec<_> = (0..4).map(|_| turns.begin().expect("one").2).collect();
         assert_eq!(first, ["b0", "a7", "b1", "a8"]);
+    }
+
+    #[test]
+    fn whoever_comes_back_at_once_goes_behind_those_that_waited_meanwhile() {
+        let mut turns = Turns::new(100);
+        for number in 0..3 {
+            join(&mut turns, "a", number);
+        }
+        let mut first = Vec::new();
+        for number in 0..3 {
+            join(&mut turns, "b", number);
+            let (_, caller, work) = turns.begin().expect("one");
+            turns.end(&caller);
+            first.push(work);
+        }
+        assert_eq!(first, ["a0", "b0", "a1"]);
     }
 
     #[test]

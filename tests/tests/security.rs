@@ -255,8 +255,7 @@ async fn the_session_of_another_is_as_one_that_never_was() {
     assert_eq!(stolen.len(), 8);
     let told = |status: &Status| {
         let mut details = status.get_error_details();
-        // The name of the call is another's by right.
-        assert!(details.request_info().is_some(), "{status}");
+        // The name of the call differs by right, where there is one.
         details.set_request_info("", "");
         (status.code(), status.message().to_owned(), format!("{details:?}"))
     };

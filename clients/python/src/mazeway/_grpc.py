@@ -76,7 +76,7 @@ class GrpcTransport:
         self._known = False
         self._channel: Any = None
         self._callables: dict[str, Callable[..., Any]] = {}
-        self._exchanges: weakref.WeakSet[_GrpcExchange] = weakref.WeakSet()
+        self._exchanges: weakref.WeakSet[_GrpcAnswers] = weakref.WeakSet()
         #: Held during a call, so that no fork comes between. Reentrant, for the garbage collector may
         #: close a forgotten environment at any point, also while this thread holds it for a fork.
         self._lock = threading.RLock()
@@ -113,6 +113,7 @@ class GrpcTransport:
         with self._counted():
             with self._translated(timeout), self._lock:
                 answers = _GrpcAnswers(self, self._callable(method)(request), timeout)
+                self._exchanges.add(answers)
             try:
                 while True:
                     answer = answers.next()
@@ -265,14 +266,18 @@ class _GrpcAnswers:
     @property
     def over(self) -> bool:
         """Whether the stream has ended, as far as is known here."""
-        return not self.alive or not self._call.is_active()
+        call = self._call
+        return call is None or not call.is_active()
 
     def next(self) -> Any:
         """The next answer; None where there are no more."""
+        call = self._call
+        if call is None:
+            return None
         self.waiting_since = time.monotonic()
         answer = None
         try:
-            answer = next(self._call)
+            answer = next(call)
         except StopIteration:
             return None
         except grpc.RpcError as error:
@@ -287,7 +292,11 @@ class _GrpcAnswers:
 
     def cancel(self) -> None:
         self.alive = False
-        self._call.cancel()
+        call, self._call = self._call, None
+        if call is not None:
+            # Not kept: what grpcio deletes only as the interpreter ends waits for ever where a thread of
+            # its own was stopped with the call's lock.
+            call.cancel()
 
 
 class _GrpcExchange(_GrpcAnswers):

@@ -171,7 +171,7 @@ impl Store {
         &self.0.activity
     }
 
-    /// Writes [`TRIAL_BYTES`] and takes them back in the same commit, to find out whether there is room for recordings again.
+    /// Writes some bytes and takes them back in the same commit, to find out whether there is room for recordings again.
     ///
     /// # Errors
     /// There is none, or the disk fails.

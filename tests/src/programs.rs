@@ -1,5 +1,6 @@
 //! The programs `server` and `learner` as processes, built from the present sources in the tests' own profile.
 
+use mazeway_bench_program::{cargo, profile};
 use std::{
     env,
     io::{BufRead as _, BufReader},
@@ -7,22 +8,6 @@ use std::{
     process::{Child, Command, Stdio},
     sync::OnceLock,
 };
-
-/// Cargo, as if called from a shell: it sets variables for a test that build scripts of dependencies look at, and would
-/// build them, and all that stands on them, again and again.
-pub fn cargo() -> Command {
-    let mut cargo = Command::new(env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
-    for (name, _) in env::vars_os() {
-        let of_package = |name: &str| {
-            name == "CARGO_CRATE_NAME"
-                || ["CARGO_PKG_", "CARGO_MANIFEST_", "CARGO_BIN_"].iter().any(|start| name.starts_with(start))
-        };
-        if name.to_str().is_some_and(of_package) {
-            cargo.env_remove(name);
-        }
-    }
-    cargo
-}
 
 /// The path of `server` or `learner`.
 ///
@@ -32,8 +17,7 @@ pub fn program(name: &str) -> PathBuf {
     static DIRECTORY: OnceLock<PathBuf> = OnceLock::new();
     let directory = DIRECTORY.get_or_init(|| {
         let own = env::current_exe().expect("a path of this test");
-        let profile = own.ancestors().nth(2).and_then(Path::file_name).expect("a profile's directory");
-        let profile = if profile == "debug" { "dev" } else { profile.to_str().expect("a name in UTF-8") };
+        let profile = profile(own.ancestors().nth(2).expect("a profile's directory"));
         let mut cargo = cargo();
         cargo.args(["build", "--quiet", "--workspace", "--bin", "server", "--bin", "learner", "--profile", profile]);
         // With a test among the targets, dependencies have the features that they have in `cargo test --workspace`: what

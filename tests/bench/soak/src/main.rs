@@ -8,11 +8,7 @@ use mazeway_bench_soak::{
     load::{Kind, Share},
     run::{Plan, run},
 };
-use std::{
-    path::PathBuf,
-    process::{Command, ExitCode},
-    time::Duration,
-};
+use std::{path::PathBuf, process::ExitCode, time::Duration};
 
 #[derive(Debug, Parser)]
 #[command(about = "Holds a server under the load of two thousand sessions", args_conflicts_with_subcommands = true)]
@@ -79,7 +75,7 @@ fn main() -> ExitCode {
     let RunArgs { minutes, pinned, json, server } = cli.run;
     let time = Duration::try_from_secs_f64(minutes * 60.0).unwrap_or(Duration::from_mins(5));
     let soak = std::env::current_exe().expect("a path of this program");
-    let plan = Plan { server: server.unwrap_or_else(build_server), soak, time, pinned };
+    let plan = Plan { server: server.unwrap_or_else(mazeway_bench_program::server), soak, time, pinned };
     match run(&plan) {
         Ok(report) => {
             if json {
@@ -94,19 +90,4 @@ fn main() -> ExitCode {
             ExitCode::FAILURE
         }
     }
-}
-
-/// The server in the profile of this program.
-fn build_server() -> PathBuf {
-    let own = std::env::current_exe().expect("a path of this program");
-    let directory = own.ancestors().nth(1).expect("a profile's directory");
-    let profile = match directory.file_name().and_then(|name| name.to_str()) {
-        Some("debug") | None => "dev",
-        Some(name) => name,
-    };
-    let mut cargo = Command::new(std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
-    cargo.args(["build", "--quiet", "-p", "mazeway-server", "--bin", "server", "--profile", profile]);
-    let status = cargo.current_dir(env!("CARGO_MANIFEST_DIR")).status().expect("cargo");
-    assert!(status.success(), "{cargo:?}: {status}");
-    directory.join(format!("server{}", std::env::consts::EXE_SUFFIX))
 }

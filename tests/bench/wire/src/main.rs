@@ -117,7 +117,7 @@ fn main() {
         println!("{}", report.to_json());
         return;
     }
-    let server = cli.server.clone().unwrap_or_else(build_server);
+    let server = cli.server.clone().unwrap_or_else(mazeway_bench_program::server);
     let mut report = Report::new(cli.rounds);
     for &mode in &cli.modes {
         let (this, parts) = (std::env::current_exe().expect("a path of this program"), parts_of(mode, &cli.parts));
@@ -151,21 +151,6 @@ fn parts_of(mode: Mode, parts: &[Part]) -> String {
     let of_all_modes = |part: &&Part| mode == Mode::Idle || !matches!(part, Part::Memory | Part::Scale);
     let names = parts.iter().filter(of_all_modes).filter_map(ValueEnum::to_possible_value);
     names.map(|value| value.get_name().to_owned()).collect::<Vec<_>>().join(",")
-}
-
-/// The server in the profile of this program.
-fn build_server() -> PathBuf {
-    let own = std::env::current_exe().expect("a path of this program");
-    let directory = own.ancestors().nth(2).expect("a profile's directory");
-    let profile = match directory.file_name().and_then(|name| name.to_str()) {
-        Some("debug") | None => "dev",
-        Some(name) => name,
-    };
-    let mut cargo = Command::new(std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
-    cargo.args(["build", "--quiet", "-p", "mazeway-server", "--bin", "server", "--profile", profile]);
-    let status = cargo.current_dir(env!("CARGO_MANIFEST_DIR")).status().expect("cargo");
-    assert!(status.success(), "{cargo:?}: {status}");
-    directory.join(format!("server{}", std::env::consts::EXE_SUFFIX))
 }
 
 fn measure(setting: &Setting, parts: &[Part]) -> Report {

@@ -8,22 +8,26 @@ use super::{
 };
 use std::{
     io,
+    mem::MaybeUninit,
     pin::Pin,
     sync::{
         Arc,
         atomic::{AtomicBool, AtomicUsize, Ordering},
     },
-    task::{Context, Poll},
+    task::{Context, Poll, ready},
     time::Duration,
 };
 use tokio::{
     io::{AsyncRead, AsyncWrite, ReadBuf},
     sync::{OwnedSemaphorePermit, Semaphore},
+    time::{Sleep, sleep},
 };
 use tokio_rustls::server::TlsStream;
 
 /// Pause after a connection that could not be taken: most often there are too many open files, and waiting helps.
 const PAUSE: Duration = Duration::from_millis(50);
+/// Time that a peer has to end a connection that we have ended. What it sent meanwhile is thrown away.
+const LINGER: Duration = Duration::from_secs(2);
 
 /// Takes connections, `max` at a time.
 #[derive(Debug)]
@@ -106,17 +110,19 @@ pub struct Connection {
     bytes: Bytes,
     /// Told of the first byte that comes, and no more.
     spoken: Option<Arc<AtomicBool>>,
+    /// How long the peer may take to end, once we have.
+    linger: Option<Pin<Box<Sleep>>>,
 }
 
 impl Connection {
     /// A connection that is not encrypted. `spoken` becomes true with the first byte from the peer.
     pub fn plain(socket: Socket, spoken: Arc<AtomicBool>) -> Self {
-        Self { bytes: Bytes::Plain(socket), spoken: Some(spoken) }
+        Self { bytes: Bytes::Plain(socket), spoken: Some(spoken), linger: None }
     }
 
     /// A connection whose handshake is done.
     pub fn tls(stream: TlsStream<Socket>, spoken: Arc<AtomicBool>) -> Self {
-        Self { bytes: Bytes::Tls(Box::new(stream)), spoken: Some(spoken) }
+        Self { bytes: Bytes::Tls(Box::new(stream)), spoken: Some(spoken), linger: None }
     }
 }
 
@@ -152,10 +158,27 @@ impl AsyncWrite for Connection {
         }
     }
 
+    /// Ends our half, and then waits for the peer to end its own: a socket that is closed with bytes unread is reset, and a
+    /// peer that writes to it fails before it has read our last words.
     fn poll_shutdown(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
-        match &mut self.bytes {
-            Bytes::Plain(socket) => Pin::new(socket).poll_shutdown(cx),
-            Bytes::Tls(stream) => Pin::new(stream).poll_shutdown(cx),
+        if self.linger.is_none() {
+            ready!(match &mut self.bytes {
+                Bytes::Plain(socket) => Pin::new(socket).poll_shutdown(cx),
+                Bytes::Tls(stream) => Pin::new(stream).poll_shutdown(cx),
+            })?;
+        }
+        let ends = self.linger.get_or_insert_with(|| Box::pin(sleep(LINGER))).as_mut().poll(cx);
+        if ends.is_ready() {
+            return Poll::Ready(Ok(()));
+        }
+        let mut unread = [MaybeUninit::uninit(); 4 << 10];
+        loop {
+            let mut unread = ReadBuf::uninit(&mut unread);
+            match ready!(self.as_mut().poll_read(cx, &mut unread)) {
+                Ok(()) if !unread.filled().is_empty() => {}
+                // It has ended, or is gone.
+                Ok(()) | Err(_) => return Poll::Ready(Ok(())),
+            }
         }
     }
 
@@ -175,5 +198,47 @@ impl AsyncWrite for Connection {
             Bytes::Plain(socket) => socket.is_write_vectored(),
             Bytes::Tls(stream) => stream.is_write_vectored(),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use tokio::{
+        io::{AsyncReadExt as _, AsyncWriteExt as _},
+        net::{TcpListener, TcpStream},
+    };
+
+    #[tokio::test]
+    async fn a_peer_that_goes_on_sending_reads_our_last_words() {
+        let listener = TcpListener::bind("127.0.0.1:0").await.expect("listens");
+        let mut peer = TcpStream::connect(listener.local_addr().expect("an address")).await.expect("connects");
+        peer.write_all(&[1; 64 << 10]).await.expect("nobody has gone yet");
+        let accepted = Accepted::from(listener.accept().await.expect("accepts").0.into_std().expect("a socket"));
+        let socket = accepted.into_socket().expect("a socket");
+        let closing = tokio::spawn(async {
+            let mut connection = Connection::plain(socket, Arc::default());
+            connection.write_all(b"goodbye").await.expect("sends");
+            connection.shutdown().await.expect("ends well");
+        });
+        tokio::time::sleep(Duration::from_millis(50)).await;
+        peer.write_all(&[2; 64 << 10]).await.expect("the socket was not reset");
+        let mut heard = String::new();
+        peer.read_to_string(&mut heard).await.expect("an end without a reset");
+        assert_eq!(heard, "goodbye");
+        drop(peer);
+        closing.await.expect("ends well");
+    }
+
+    #[tokio::test]
+    async fn a_peer_that_never_ends_is_not_waited_for() {
+        let listener = TcpListener::bind("127.0.0.1:0").await.expect("listens");
+        let peer = TcpStream::connect(listener.local_addr().expect("an address")).await.expect("connects");
+        let accepted = Accepted::from(listener.accept().await.expect("accepts").0.into_std().expect("a socket"));
+        let mut connection = Connection::plain(accepted.into_socket().expect("a socket"), Arc::default());
+        let began = std::time::Instant::now();
+        connection.shutdown().await.expect("ends well");
+        assert!(began.elapsed() >= LINGER);
+        drop(peer);
     }
 }

@@ -46,6 +46,10 @@ pub struct Config {
     /// Threads that serve connections, each connection on one of them; 0: as many as there are cores.
     #[arg(long, default_value_t = 0, value_name = "N")]
     pub threads: usize,
+    /// Microseconds for which a thread that has read something looks for more before it sleeps, where that has paid before;
+    /// 0: it sleeps at once.
+    #[arg(long, default_value_t = 100, value_parser = clap::value_parser!(u64).range(..=10_000), value_name = "N")]
+    pub spin_micros: u64,
     /// Time between HTTP/2 pings that find out whether a silent peer is still there, in seconds.
     #[arg(long = "keepalive-secs", default_value = "10", value_parser = seconds, value_name = "SECS")]
     pub keepalive: Duration,
@@ -73,6 +77,7 @@ impl Default for Config {
             max_concurrent_models: 2,
             max_streams_per_connection: 2048,
             threads: 0,
+            spin_micros: 100,
             keepalive: Duration::from_secs(10),
             shutdown_grace: Duration::from_secs(5),
             door: DoorConfig::default(),
@@ -87,6 +92,11 @@ impl Config {
             0 => std::thread::available_parallelism().map_or(1, usize::from),
             threads => threads,
         }
+    }
+
+    /// Longest time for which a thread looks for more before it sleeps.
+    pub fn spin(&self) -> Duration {
+        Duration::from_micros(self.spin_micros)
     }
 
     /// What sessions may take.

@@ -7,21 +7,22 @@
 use crate::errors::ForeignProcessError;
 use pyo3::prelude::*;
 use std::{
-    future::Future,
+    future::{Future, poll_fn},
     io,
-    pin::pin,
+    pin::{Pin, pin},
     process,
     sync::{
-        Arc, Mutex, PoisonError, Weak,
+        Arc, Mutex, MutexGuard, PoisonError, Weak,
         atomic::{AtomicU64, Ordering},
     },
+    task::Poll,
     thread,
     time::{Duration, Instant},
 };
 use tokio::{
     runtime::{Builder, Runtime},
     task::yield_now,
-    time::timeout,
+    time::{Sleep, sleep_until},
 };
 
 /// How often a wait asks Python whether a signal came.
@@ -54,12 +55,14 @@ pub struct Driver {
     began: Instant,
     /// Milliseconds from then to its last use.
     used_ms: AtomicU64,
+    /// Ends a wait now and then, whichever comes next: to set a timer for each costs more than a step has to spare.
+    alarm: Mutex<Option<Pin<Box<Sleep>>>>,
 }
 
 impl Driver {
     pub fn new() -> io::Result<Self> {
         let runtime = Some(Builder::new_current_thread().enable_io().enable_time().build()?);
-        Ok(Self { runtime, began: Instant::now(), used_ms: AtomicU64::new(0) })
+        Ok(Self { runtime, began: Instant::now(), used_ms: AtomicU64::new(0), alarm: Mutex::default() })
     }
 
     pub fn runtime(&self) -> &Runtime {
@@ -86,18 +89,40 @@ impl Driver {
     {
         let mut future = pin!(future);
         let deadline = Instant::now() + patience.min(LONGEST);
-        loop {
-            let slice = deadline.saturating_duration_since(Instant::now()).min(SIGNALS);
-            let done = py.detach(|| self.runtime().block_on(async { timeout(slice, future.as_mut()).await }));
+        // Another thread that waits meanwhile makes one of its own.
+        let mut alarm = self.alarm().take();
+        let outcome = loop {
+            let done = py.detach(|| {
+                self.runtime().block_on(async {
+                    let soon = || deadline.min(Instant::now() + SIGNALS).into();
+                    let alarm = alarm.get_or_insert_with(|| Box::pin(sleep_until(soon())));
+                    if alarm.is_elapsed() || alarm.deadline() > deadline.into() {
+                        alarm.as_mut().reset(soon());
+                    }
+                    poll_fn(|cx| match future.as_mut().poll(cx) {
+                        Poll::Ready(output) => Poll::Ready(Some(output)),
+                        Poll::Pending => alarm.as_mut().poll(cx).map(|()| None),
+                    })
+                    .await
+                })
+            });
             self.touch();
-            match done {
-                Ok(output) => return Ok(output),
-                Err(_) => py.check_signals().map_err(Stopped::Raised)?,
+            if let Some(output) = done {
+                break Ok(output);
+            }
+            if let Err(error) = py.check_signals() {
+                break Err(Stopped::Raised(error));
             }
             if Instant::now() >= deadline {
-                return Err(Stopped::Late);
+                break Err(Stopped::Late);
             }
-        }
+        };
+        *self.alarm() = alarm;
+        outcome
+    }
+
+    fn alarm(&self) -> MutexGuard<'_, Option<Pin<Box<Sleep>>>> {
+        self.alarm.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// [`Self::turn`] with the interpreter released.

@@ -106,6 +106,9 @@ pub struct ConnectOptions {
     pub deadline: Duration,
     /// Longest wait for the next message of a fit, a roll-out or a model, which may wait for its turn or be silent for long.
     pub work_deadline: Duration,
+    /// How long the answer to a step is looked for before its caller sleeps, on a runtime of a single thread and where that
+    /// has paid before; zero: never.
+    pub spin: Duration,
 }
 
 impl Default for ConnectOptions {
@@ -119,6 +122,7 @@ impl Default for ConnectOptions {
             connect_timeout: Duration::from_secs(5),
             deadline: Duration::from_mins(1),
             work_deadline: Duration::from_mins(10),
+            spin: Duration::from_micros(100),
         }
     }
 }
@@ -263,6 +267,7 @@ pub struct Wire {
     token: Option<Token>,
     pub(crate) deadline: Duration,
     pub(crate) work_deadline: Duration,
+    pub(crate) spin: Duration,
 }
 
 impl Wire {
@@ -271,9 +276,12 @@ impl Wire {
     /// # Errors
     /// An address that is none, options that do not go with it; nobody answers.
     pub async fn open(address: &str, options: &ConnectOptions) -> Result<Self, ClientError> {
-        let channel = open(address, options).await?;
-        let ConnectOptions { token, deadline, work_deadline, .. } = options.clone();
-        Ok(Self { channel, token, deadline, work_deadline })
+        Ok(Self::over(open(address, options).await?, options))
+    }
+
+    fn over(channel: Channel, options: &ConnectOptions) -> Self {
+        let ConnectOptions { token, deadline, work_deadline, spin, .. } = options.clone();
+        Self { channel, token, deadline, work_deadline, spin }
     }
 
     /// Waits for the answer to a call.
@@ -299,8 +307,7 @@ pub(crate) async fn within<T>(
 impl From<Channel> for Wire {
     /// Without a token, with the default deadlines.
     fn from(channel: Channel) -> Self {
-        let ConnectOptions { token, deadline, work_deadline, .. } = ConnectOptions::default();
-        Self { channel, token, deadline, work_deadline }
+        Self::over(channel, &ConnectOptions::default())
     }
 }
 

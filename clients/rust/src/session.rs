@@ -117,7 +117,7 @@ impl Session {
         let spec = created.spec.ok_or_else(|| ClientError::protocol("expected a description of the session"))?;
         let lease = created.lease.and_then(|lease| Duration::try_from(lease).ok()).unwrap_or(RECONNECT);
         Ok(Self {
-            patience: Patience::new(connection.wire.deadline),
+            patience: Patience::new(connection.wire.deadline, connection.wire.spin),
             connection,
             id: created.session_id,
             spec: EnvSpec::from_wire(spec)?,

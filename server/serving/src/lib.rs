@@ -14,6 +14,7 @@ pub mod listen;
 pub mod rules;
 pub mod settings;
 pub mod socket;
+pub mod spin;
 pub mod telemetry;
 pub mod tls;
 pub mod token_command;

@@ -1,6 +1,6 @@
 //! A connection's bytes as they are on the wire: counted, and read when it is the connection's turn.
 
-use crate::{fair::Pass, telemetry::Connections};
+use crate::{fair::Pass, spin, telemetry::Connections};
 use std::{
     io,
     pin::Pin,
@@ -59,6 +59,9 @@ impl AsyncRead for Socket {
         let bytes = buf.filled().len() - before;
         if let Some(pass) = pass {
             pass.used(bytes);
+        }
+        if bytes > 0 {
+            spin::read();
         }
         numbers.received.add(bytes as u64);
         Poll::Ready(read)

@@ -81,7 +81,7 @@ pub async fn serve_observed(
     let gate = Gate::new(listener.into(), config.door.max_connections, &telemetry);
     let door = Arc::new(Door::new(&config.door, rule, &telemetry)?);
     let (wire, door_config) = (wire(&config), config.door.clone());
-    let (threads, grace) = (config.threads(), config.shutdown_grace);
+    let (threads, grace, spin) = (config.threads(), config.shutdown_grace, config.spin());
     let host = Arc::new(Host::new(config, &telemetry, stopping.clone()));
     let routes = Routes::new(Environments::new(&host))
         .add_service(dm_env::EnvironmentServer(Arc::clone(&host)))
@@ -89,7 +89,7 @@ pub async fn serve_observed(
         .add_service(reflection().build_v1()?)
         .add_service(reflection().build_v1alpha()?);
     let transport = Transport::new(&door_config, wire, Arc::clone(&door), routes)?;
-    let start = |_| Worker::start(transport.clone(), stopping.clone(), grace);
+    let start = |_| Worker::start(transport.clone(), stopping.clone(), grace, spin);
     let mut workers = (0..threads).map(start).collect::<Result<Vec<_>, _>>()?;
     let reaper = tokio::spawn(host.reap_sessions());
     let hand_over = async {

@@ -9,6 +9,7 @@ use mazeway_serving::{
     connections::{Counted, Load},
     fair::Lane,
     listen::Accepted,
+    spin::spin,
     transport::Transport,
 };
 use std::{io, thread, time::Duration};
@@ -26,14 +27,25 @@ pub struct Worker {
 }
 
 impl Worker {
-    /// Starts a thread that serves what it is given until `stopping`, and then for `grace` what is under way.
-    pub fn start(transport: Transport, stopping: CancellationToken, grace: Duration) -> Result<Self, ServeError> {
+    /// Starts a thread that serves what it is given until `stopping`, and then for `grace` what is under way. It looks for
+    /// more for as long as `most_spin` before it sleeps.
+    pub fn start(
+        transport: Transport,
+        stopping: CancellationToken,
+        grace: Duration,
+        most_spin: Duration,
+    ) -> Result<Self, ServeError> {
         let (arrivals, arriving) = mpsc::unbounded_channel();
         let (end, ended) = oneshot::channel();
         let runtime =
             tokio::runtime::Builder::new_current_thread().enable_all().build().map_err(ServeError::Threads)?;
         let work = move || {
-            runtime.block_on(serve(transport, arriving, stopping, grace));
+            runtime.block_on(async {
+                // Both end with the runtime.
+                tokio::spawn(Lane::open());
+                tokio::spawn(spin(most_spin));
+                serve(transport, arriving, stopping, grace).await;
+            });
             // What still runs on threads for blocking work ends by itself: nobody waits for its outcome.
             runtime.shutdown_background();
             let _ = end.send(());
@@ -66,8 +78,6 @@ async fn serve(
     grace: Duration,
 ) {
     let connections = TaskTracker::new();
-    // Ends with the runtime.
-    tokio::spawn(Lane::open());
     loop {
         let arrived = tokio::select! {
             biased;

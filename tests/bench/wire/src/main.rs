@@ -40,6 +40,7 @@ mod watching;
 
 use clap::{Parser, ValueEnum};
 use figures::Report;
+use mazeway_client::{ConnectOptions, Connection};
 use std::{
     path::PathBuf,
     process::{Command, Stdio},
@@ -84,6 +85,9 @@ struct Cli {
     /// Short rounds, few of them: to see that it runs.
     #[arg(long)]
     quick: bool,
+    /// Microseconds for which client and server look for bytes before they sleep; 0: they sleep at once.
+    #[arg(long, default_value_t = 100, value_name = "N")]
+    spin_micros: u64,
     /// The binary `server`; built from the present sources where it is not given.
     #[arg(long, value_name = "FILE")]
     server: Option<PathBuf>,
@@ -103,6 +107,15 @@ struct Setting {
     slice: Duration,
     server: PathBuf,
     quick: bool,
+    spin_micros: u64,
+}
+
+impl Setting {
+    /// A connection to Mazeway's server at `address`.
+    async fn connect(&self, address: &str) -> Connection {
+        let options = ConnectOptions { spin: Duration::from_micros(self.spin_micros), ..ConnectOptions::default() };
+        Connection::connect(address, &options).await.expect("connects")
+    }
 }
 
 fn main() {
@@ -113,7 +126,10 @@ fn main() {
     if let Some(mode) = cli.within {
         let server = cli.server.expect("the first process names it");
         let (rounds, slice) = if cli.quick { (3, Duration::from_millis(5)) } else { (cli.rounds, figures::SLICE) };
-        let report = measure(&Setting { mode, rounds, slice, server, quick: cli.quick }, &cli.parts);
+        let report = measure(
+            &Setting { mode, rounds, slice, server, quick: cli.quick, spin_micros: cli.spin_micros },
+            &cli.parts,
+        );
         println!("{}", report.to_json());
         return;
     }
@@ -130,6 +146,7 @@ fn main() {
         }
         let name = mode.to_possible_value().expect("a name").get_name().to_owned();
         command.args(["--within", &name, "--parts", &parts, "--rounds", &cli.rounds.to_string()]);
+        command.args(["--spin-micros", &cli.spin_micros.to_string()]);
         command.arg("--server").arg(&server).args(cli.quick.then_some("--quick"));
         let output = command.stderr(Stdio::inherit()).output().expect("taskset and this program");
         assert!(output.status.success(), "{command:?}: {}", output.status);

@@ -29,6 +29,7 @@ impl Process {
         let mut command = Command::new(&setting.server);
         command.args(["--listen", listen, "--max-envs-per-session", "65536", "--max-total-envs", "1000000"]);
         command.args(["--max-sessions", "20000", "--max-connections", "20000", "--default-lease-secs", "3000"]);
+        command.args(["--spin-micros", &setting.spin_micros.to_string()]);
         for (name, _) in std::env::vars().filter(|(name, _)| name.starts_with("MAZEWAY_")) {
             command.env_remove(name);
         }

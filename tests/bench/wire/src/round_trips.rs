@@ -38,8 +38,8 @@ pub async fn sizes(address: &str, env_id: &str, num_envs: u32) -> (usize, usize)
     (request.encoded_len(), answer.encoded_len())
 }
 
-async fn open(address: &str) -> Env {
-    let mut env = Env::connect(address, "Maze-v0", endless()).await.expect("a session");
+async fn open(setting: &Setting, address: &str) -> Env {
+    let mut env = Env::create(&setting.connect(address).await, "Maze-v0", endless()).await.expect("a session");
     env.reset(Some(1)).await.expect("resets");
     env
 }
@@ -71,9 +71,9 @@ pub fn measure(setting: &Setting, report: &mut Report) {
     let (mut bidi_tcp, mut bidi_unix) = (bidi(&peers.tonic_tcp), bidi(&peers.tonic_unix));
     let mut bidi_multi = bidi(&peers.tonic_multi_thread);
     let mut unary_tcp = runtime.block_on(Tonic::connect(&peers.tonic_tcp, request, reply));
-    let mut env_tcp = runtime.block_on(open(tcp.address()));
-    let mut env_unix = runtime.block_on(open(unix.address()));
-    let env_multi = Arc::new(Mutex::new(multi.block_on(open(tcp.address()))));
+    let mut env_tcp = runtime.block_on(open(setting, tcp.address()));
+    let mut env_unix = runtime.block_on(open(setting, unix.address()));
+    let env_multi = Arc::new(Mutex::new(multi.block_on(open(setting, tcp.address()))));
     let (mut service, id) = runtime.block_on(unary(tcp.address(), "Maze-v0", 1));
 
     let mut subjects = [

@@ -16,8 +16,9 @@ const IN_FLIGHT: usize = 1000;
 /// Sizes of batches.
 const BATCHES: [u32; 7] = [1, 16, 64, 256, 1024, 4096, 65_536];
 
-async fn vector_env(address: &str, env_id: &str, num_envs: u32) -> VectorEnv {
-    let made = VectorEnv::connect(address, env_id, num_envs, Autoreset::NextStep, endless()).await;
+async fn vector_env(setting: &Setting, address: &str, env_id: &str, num_envs: u32) -> VectorEnv {
+    let connection = setting.connect(address).await;
+    let made = VectorEnv::create(&connection, env_id, num_envs, Autoreset::NextStep, endless()).await;
     let mut envs = made.expect("a session");
     envs.reset(1).await.expect("resets");
     envs
@@ -34,7 +35,7 @@ pub fn pipelined(setting: &Setting, report: &mut Report) {
         bidi
     });
     let mut envs = runtime.block_on(async {
-        let mut envs = vector_env(server.address(), "Maze-v0", 1).await;
+        let mut envs = vector_env(setting, server.address(), "Maze-v0", 1).await;
         for i in 0..IN_FLIGHT {
             envs.send_step(&[i as u32 % 4]).await.expect("sends");
         }
@@ -70,7 +71,7 @@ pub fn batches(setting: &Setting, report: &mut Report) {
     for env_id in ["Maze-v0", "Highway-v0"] {
         for num_envs in BATCHES {
             let (request, reply) = runtime.block_on(sizes(server.address(), env_id, num_envs));
-            let mut envs = runtime.block_on(vector_env(server.address(), env_id, num_envs));
+            let mut envs = runtime.block_on(vector_env(setting, server.address(), env_id, num_envs));
             let actions: Vec<u32> = (0..num_envs).map(|env| env % envs.spec().n_actions).collect();
             let mut bidi =
                 runtime.block_on(async { Tonic::connect(&peers.tonic_tcp, request, reply).await.bidi(1).await });

@@ -9,8 +9,8 @@ everything on one core (`taskset`), in mode `idle` on all of them. The cases of 
 round by round: what disturbs the machine disturbs them all. Medians over the rounds, with the lowest and the highest beside
 them.
 
-Peers: a bare TCP ping-pong in Python (the floor); Gymnasium's own wrappers around it, and around an environment that does
-nothing; bare echoes by grpcio; dm_env_rpc's, OpenEnv's and remote-gym's own servers and clients around a toy; EnvPool's FrozenLake and highway-fast,
+Peers: a bare TCP ping-pong in Python (the floor); Gymnasium's own wrappers around an environment that does nothing; bare
+echoes by grpcio; dm_env_rpc's, OpenEnv's and remote-gym's own servers and clients around a toy; EnvPool's FrozenLake and highway-fast,
 Gymnasium's vector environments and highway-env in process. Rust's own figures, the floor of blocking sockets in Rust, the
 roll-outs and the memory of the server are those of `cargo run --release -p mazeway-bench-wire`, run after the others.
 
@@ -51,8 +51,6 @@ PACKAGES = [
 APART = {"remote-gym": ["dm-env-rpc==1.1.6", "remote-gym==0.7.3"]}
 ROUND_TRIPS = [
     "tcp",
-    "tcp gymnasium",
-    "tcp gymnasium.make",
     "gymnasium",
     "gymnasium.make",
     "native",

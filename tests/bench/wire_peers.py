@@ -353,8 +353,8 @@ def step_mazeway(ports, client, wrapped=True, address=None):
     return lambda: env.step(1), 1
 
 
-def step_local(wrapped, within=lambda: None):
-    """A Gymnasium environment in this process that does nothing but `within`: what is left is Gymnasium's own."""
+def step_local(wrapped):
+    """A Gymnasium environment in this process that does nothing: what is left is Gymnasium's own."""
     import gymnasium
 
     class Local(gymnasium.Env):
@@ -366,11 +366,10 @@ def step_local(wrapped, within=lambda: None):
             return 0, {}
 
         def step(self, action):
-            within()
             return 0, 0.0, False, False, {}
 
-    spec = gymnasium.envs.registration.EnvSpec("Local-v0", Local, max_episode_steps=10**9)
-    env = gymnasium.make(spec) if wrapped else Local()
+    gymnasium.register("Local-v0", Local, max_episode_steps=10**9)
+    env = gymnasium.make("Local-v0") if wrapped else Local()
     env.reset(seed=1)
     return lambda: env.step(1), 1
 
@@ -444,9 +443,6 @@ CASES = {
     "tcp": lambda p: step_tcp(p),
     "gymnasium": lambda _: step_local(wrapped=False),
     "gymnasium.make": lambda _: step_local(wrapped=True),
-    # After a wait the caches are cold: what the wrappers take then.
-    "tcp gymnasium": lambda p: step_local(False, step_tcp(p)[0]),
-    "tcp gymnasium.make": lambda p: step_local(True, step_tcp(p)[0]),
     "native": lambda p: step_mazeway(p, "native"),
     "native unwrapped": lambda p: step_mazeway(p, "native", wrapped=False),
     "native unix": lambda p: step_mazeway(p, "native", address=f"unix:{p['mazeway unix']}"),

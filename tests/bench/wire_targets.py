@@ -2,10 +2,8 @@
 
 LABELS = {
     "tcp": "TCP ping-pong, Python sockets",
-    "tcp gymnasium": "the same as a Gymnasium environment",
-    "tcp gymnasium.make": "that in gymnasium.make's wrappers",
     "gymnasium": "an empty Gymnasium environment, in process",
-    "gymnasium.make": "that in gymnasium.make's wrappers",
+    "gymnasium.make": "the same in gymnasium.make's wrappers",
     "native": "mazeway, native, gymnasium.make",
     "native unwrapped": "mazeway, native, without wrappers",
     "native unix": "mazeway, native, Unix socket",
@@ -62,7 +60,7 @@ def targets(modes, batches, rust):
         at, ours = {name: row["median"] for name, row in rows.items()}, trips.get(mode, {})
 
         def unwrapped(floor, at=at):
-            return lambda: (at["native"] - at["tcp gymnasium.make"] + at["tcp gymnasium"]) / floor()
+            return lambda: (at["native"] - at["gymnasium.make"] + at["gymnasium"]) / floor()
 
         add(
             f"{mode}: Rust step / bare tonic stream",

@@ -62,17 +62,21 @@ impl Share {
 
     /// Makes the sessions and uses them, for ever.
     pub async fn run(self, address: String) {
-        let mut tasks = JoinSet::new();
+        // All are there before the first acts: it would be in the way of the others.
+        let mut envs = Vec::new();
         for _ in 0..self.connections {
             let connection = Connection::open(&address).await.expect("a connection");
             for _ in 0..self.sessions {
-                let env = Env::create(&connection, "Maze-v0", options(self.lease)).await.expect("a session");
-                match self.kind {
-                    Kind::Idle => tasks.spawn(idle(env, self.lease)),
-                    Kind::Stepping | Kind::Vanishing => tasks.spawn(stepping(env)),
-                    Kind::Silent => tasks.spawn(silent(address.clone(), env)),
-                };
+                envs.push(Env::create(&connection, "Maze-v0", options(self.lease)).await.expect("a session"));
             }
+        }
+        let mut tasks = JoinSet::new();
+        for env in envs {
+            match self.kind {
+                Kind::Idle => tasks.spawn(idle(env, self.lease)),
+                Kind::Stepping | Kind::Vanishing => tasks.spawn(stepping(env)),
+                Kind::Silent => tasks.spawn(silent(address.clone(), env)),
+            };
         }
         // Let all of them reset.
         sleep(Duration::from_millis(500)).await;

@@ -42,9 +42,9 @@ fn environment_bytes(env_id: &str, given: Value, autoreset: Autoreset) -> u64 {
 
 #[test]
 fn a_maze_of_a_batch_takes_less_than_64_bytes() {
-    assert_eq!(environment_bytes("Maze-v0", json!({}), Autoreset::NextStep), 62);
+    assert_eq!(environment_bytes("Maze-v0", json!({}), Autoreset::NextStep), 60);
     // Its last observation and infos come on top.
-    assert_eq!(environment_bytes("Maze-v0", json!({}), Autoreset::SameStep), 74);
+    assert_eq!(environment_bytes("Maze-v0", json!({}), Autoreset::SameStep), 72);
 }
 
 #[test]

@@ -191,22 +191,23 @@ impl Tables {
 }
 
 impl Simulator for Maze {
-    type Stored = u32;
+    /// The state: there are at most 65,536.
+    type Stored = u16;
     const STEP_NANOS: usize = 9;
 
-    fn stored(&self) -> u32 {
-        self.state
+    fn stored(&self) -> u16 {
+        self.state as u16
     }
 
     #[inline]
-    fn load<'a>(scratch: &'a mut Self, stored: &'a mut u32) -> &'a mut Self {
-        scratch.state = *stored;
+    fn load<'a>(scratch: &'a mut Self, stored: &'a mut u16) -> &'a mut Self {
+        scratch.state = u32::from(*stored);
         scratch
     }
 
     #[inline]
-    fn save(scratch: &Self, stored: &mut u32) {
-        *stored = scratch.state;
+    fn save(scratch: &Self, stored: &mut u16) {
+        *stored = scratch.stored();
     }
 
     fn reset(&mut self, rng: &mut Rng) {
@@ -239,7 +240,7 @@ impl Simulator for Maze {
 
     fn write_rows(
         scratch: &mut Self,
-        stored: &mut [u32],
+        stored: &mut [u16],
         first: usize,
         observations: &mut [u8],
         _observation_len: usize,
@@ -247,7 +248,7 @@ impl Simulator for Maze {
         _info_lens: &[usize],
     ) {
         for (out, state) in observations.as_chunks_mut().0[first..].iter_mut().zip(&*stored) {
-            *out = state.to_le_bytes();
+            *out = u32::from(*state).to_le_bytes();
         }
         if let [rows, columns] = infos {
             let rows = rows.as_chunks_mut().0[first..].iter_mut();

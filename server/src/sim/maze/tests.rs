@@ -213,3 +213,13 @@ proptest! {
         }
     }
 }
+
+#[test]
+fn the_last_state_of_the_largest_maze_is_kept() {
+    let mut maze = made(json!({"layout": vec![".".repeat(256); 256]})).unwrap().prototype;
+    maze.state = maze.tables.layout.n_states() - 1;
+    assert_eq!(maze.state, 65_535);
+    let (mut stored, mut scratch) = (maze.stored(), maze.clone());
+    scratch.state = 0;
+    assert_eq!(Maze::load(&mut scratch, &mut stored).state, maze.state);
+}

@@ -213,7 +213,7 @@ mod tests {
     async fn a_peer_that_goes_on_sending_reads_our_last_words() {
         let listener = TcpListener::bind("127.0.0.1:0").await.expect("listens");
         let mut peer = TcpStream::connect(listener.local_addr().expect("an address")).await.expect("connects");
-        peer.write_all(&[1; 64 << 10]).await.expect("nobody has gone yet");
+        peer.write_all(&vec![1; 64 << 10]).await.expect("nobody has gone yet");
         let accepted = Accepted::from(listener.accept().await.expect("accepts").0.into_std().expect("a socket"));
         let socket = accepted.into_socket().expect("a socket");
         let closing = tokio::spawn(async {
@@ -222,7 +222,7 @@ mod tests {
             connection.shutdown().await.expect("ends well");
         });
         tokio::time::sleep(Duration::from_millis(50)).await;
-        peer.write_all(&[2; 64 << 10]).await.expect("the socket was not reset");
+        peer.write_all(&vec![2; 64 << 10]).await.expect("the socket was not reset");
         let mut heard = String::new();
         peer.read_to_string(&mut heard).await.expect("an end without a reset");
         assert_eq!(heard, "goodbye");

@@ -116,9 +116,12 @@ async fn spin_while(most: Duration, is_alone: fn() -> bool) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use tokio::time::sleep;
 
-    const MOST: Duration = Duration::from_millis(1);
+    const MINUTE: Duration = Duration::from_mins(1);
+
+    thread_local! {
+        static ALONE: Cell<bool> = const { Cell::new(true) };
+    }
 
     fn is_asleep() -> bool {
         READS.with(|reads| reads.awaited.get() != u64::MAX)
@@ -127,16 +130,16 @@ mod tests {
     /// How many reads the spinner sleeps for, once it does.
     async fn slept() -> u64 {
         while !is_asleep() {
-            sleep(MOST).await;
+            yield_now().await;
         }
         READS.with(|reads| reads.awaited.get()) - count()
     }
 
     #[tokio::test]
     async fn looks_until_something_comes_or_the_time_is_up() {
-        assert!(!look(MOST, || true).await);
-        let looking = tokio::spawn(look(Duration::from_mins(1), || true));
-        sleep(MOST).await;
+        assert!(!look(Duration::from_millis(1), || true).await);
+        let looking = tokio::spawn(look(MINUTE, || true));
+        yield_now().await;
         assert!(!looking.is_finished());
         read();
         assert!(looking.await.expect("an end"));
@@ -144,22 +147,28 @@ mod tests {
 
     #[tokio::test]
     async fn looks_ever_more_rarely_in_vain_and_at_once_again_where_it_pays() {
-        let long = Duration::from_millis(20);
-        tokio::spawn(spin_while(long, || true));
+        tokio::spawn(spin_while(MINUTE, || ALONE.get()));
+        ALONE.set(false);
         for reads in (0..=MOST_IN_VAIN).chain([MOST_IN_VAIN]).map(|in_vain| 1 << in_vain) {
             assert_eq!(slept().await, reads);
             (0..reads).for_each(|_| read());
         }
         // It looks now, and what it sees makes up for all that was in vain.
-        sleep(MOST).await;
-        assert!(!is_asleep());
+        ALONE.set(true);
+        for _ in 0..10 {
+            yield_now().await;
+            assert!(!is_asleep());
+        }
         read();
+        yield_now().await;
+        yield_now().await;
+        ALONE.set(false);
         assert_eq!(slept().await, 2);
     }
 
     #[tokio::test]
     async fn leaves_the_core_to_others_and_never_looks_where_it_shall_not() {
-        assert!(!look(Duration::from_mins(1), || false).await);
+        assert!(!look(MINUTE, || false).await);
         spin(Duration::ZERO).await;
     }
 }

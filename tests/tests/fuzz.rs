@@ -1,4 +1,4 @@
-//! A short run of every fuzzing target; `tests/bench/fuzz.sh` runs them for long. See `mazeway_tests::fuzz`.
+//! A short run of every fuzzing target; `tests/bench/reliability.sh fuzz` runs them for long. See `mazeway_tests::fuzz`.
 
 use mazeway_tests::fuzz::{
     run,

@@ -18,6 +18,9 @@ struct Reason {
     reason: &'static str,
 }
 
+/// Every reason that there is: shown from the start, so that the first refusal is seen to come.
+const REASONS: [&str; 7] = ["sessions", "environments", "lease", "options", "unknown_environment", "stopping", "other"];
+
 /// Numbers that calls and streams add to.
 #[derive(Debug)]
 pub struct Numbers {
@@ -37,6 +40,9 @@ impl Numbers {
             refused: Family::default(),
         };
         telemetry.add("steps", "Steps of environments, those of a batch counted one by one", numbers.steps.clone());
+        for reason in REASONS {
+            drop(numbers.refused.get_or_create(&Reason { reason }));
+        }
         let help = "Time in which the server steps a batch and writes the answer, without the wire";
         telemetry.add("step_seconds", help, numbers.step_times.clone());
         telemetry.add("rollout_steps", "Steps of roll-outs that were sent", numbers.rollout_steps.clone());

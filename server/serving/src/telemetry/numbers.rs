@@ -139,7 +139,9 @@ impl Times {
     /// Upper ends in seconds, and how many are in each and in no lower one.
     fn buckets(&self) -> [(f64, u64); BUCKETS + 1] {
         std::array::from_fn(|bucket| {
-            let end = if bucket == BUCKETS { f64::MAX } else { (1_u64 << (self.shift + bucket as u32)) as f64 / 1e9 };
+            // Written as +Inf, which is the bucket of all of them.
+            let end =
+                if bucket == BUCKETS { f64::INFINITY } else { (1_u64 << (self.shift + bucket as u32)) as f64 / 1e9 };
             (end, self.parts.iter().map(|part| part.0.buckets[bucket].load(Relaxed)).sum())
         })
     }

@@ -15,7 +15,8 @@ use tokio::{
     net::TcpStream,
     time::{Instant, sleep, timeout},
 };
-use tonic::{Request, Response, transport::Channel};
+use tonic::{Request, Response, Status, Streaming, transport::Channel};
+use tonic_health::pb::{HealthCheckRequest, HealthCheckResponse, health_client::HealthClient};
 
 type Service = EnvironmentServiceClient<Channel>;
 
@@ -33,9 +34,10 @@ async fn lists(service: &mut Service) -> bool {
 
 #[tokio::test]
 async fn a_call_that_asks_for_no_deadline_has_one() {
-    let server = server(DoorConfig { call_deadline: Duration::from_millis(1), ..DoorConfig::default() });
+    let door = DoorConfig { call_deadline: Duration::from_millis(1), ..DoorConfig::default() };
+    let server = EnvServer::with(Config { door, max_envs_per_session: 65_536, ..config() });
     let mut service = service(&server).await;
-    let large = pb::CreateSessionRequest { env_id: "Highway-v0".into(), num_envs: 16_384, ..Default::default() };
+    let large = pb::CreateSessionRequest { env_id: "Highway-v0".into(), num_envs: 65_536, ..Default::default() };
     let status = service.create_session(large).await.expect_err("it takes longer");
     assert_eq!(status.code(), Code::DeadlineExceeded, "{status}");
     // A stream has the deadline that it asks for, and none otherwise.
@@ -78,11 +80,69 @@ async fn silent_and_idle_connections_are_closed_and_used_ones_stay() {
     idle.write_all(b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n\0\0\0\x04\0\0\0\0\0").await.expect("greets");
     let (silent, idle) = tokio::join!(ends(silent), ends(idle));
     assert!(silent >= Duration::from_millis(250) && idle >= Duration::from_millis(800), "{silent:?}, {idle:?}");
-    // Half a greeting is no better than none.
-    let mut half = TcpStream::connect(server.socket()).await.expect("connects");
-    half.write_all(b"PRI * HTT").await.expect("greets");
-    ends(half).await;
+    // Half a greeting is no better than none, nor is one without its last byte.
+    for half in [&b"PRI * HTT"[..], b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r"] {
+        let mut connection = TcpStream::connect(server.socket()).await.expect("connects");
+        connection.write_all(half).await.expect("greets");
+        let half = ends(connection).await;
+        assert!(half >= Duration::from_millis(250) && half < Duration::from_millis(800), "{half:?}");
+    }
     timeout(Duration::from_millis(100), stream.message()).await.expect_err("it goes on");
+}
+
+async fn watch(channel: &Channel) -> Result<Streaming<HealthCheckResponse>, Status> {
+    let mut watched = HealthClient::new(channel.clone()).watch(HealthCheckRequest::default()).await?.into_inner();
+    watched.message().await?.expect("a status");
+    Ok(watched)
+}
+
+#[tokio::test]
+async fn health_streams_keep_no_connection_and_end_with_theirs() {
+    let server = server(DoorConfig { idle_timeout: Duration::from_millis(600), ..DoorConfig::default() });
+    let (strangers, used) = (channel(&server.address()).await, channel(&server.address()).await);
+    let (strangers, used) = (strangers.expect("a channel"), used.expect("a channel"));
+    let mut service = EnvironmentServiceClient::new(used.clone());
+    let mut stream = service.interact(tokio_stream::pending()).await.expect("a stream").into_inner();
+    let mut kept = watch(&used).await.expect("health");
+    let begun = Instant::now();
+    let mut watched = watch(&strangers).await.expect("health");
+    let checking = async {
+        // Nor do calls that are over at once.
+        loop {
+            HealthClient::new(strangers.clone()).check(HealthCheckRequest::default()).await.expect("health");
+            sleep(Duration::from_millis(100)).await;
+        }
+    };
+    let status = tokio::select! {
+        ended = timeout(Duration::from_secs(5), watched.message()) => ended.expect("an end").expect_err("a status"),
+        () = checking => unreachable!("it never ends"),
+    };
+    assert_eq!(status.code(), Code::Unavailable, "{status}");
+    assert!(begun.elapsed() >= Duration::from_millis(500), "{:?}", begun.elapsed());
+    // Who is told so comes again.
+    watch(&strangers).await.expect("health");
+    timeout(Duration::from_millis(100), kept.message()).await.expect_err("it goes on beside a stream that is used");
+    timeout(Duration::from_millis(100), stream.message()).await.expect_err("it goes on");
+}
+
+#[tokio::test]
+async fn calls_that_need_nothing_are_few_on_a_connection() {
+    let server = server(DoorConfig::default());
+    let channel = channel(&server.address()).await.expect("a channel");
+    let mut watched = Vec::new();
+    for _ in 0..32 {
+        watched.push(watch(&channel).await.expect("health"));
+    }
+    let status = watch(&channel).await.expect_err("one too many");
+    assert_eq!(status.code(), Code::ResourceExhausted, "{status}");
+    assert!(lists(&mut EnvironmentServiceClient::new(channel.clone())).await, "all else goes on");
+    watched.pop();
+    let again = async {
+        while watch(&channel).await.is_err() {
+            sleep(Duration::from_millis(10)).await;
+        }
+    };
+    timeout(Duration::from_secs(5), again).await.expect("there is room again");
 }
 
 #[tokio::test]

@@ -124,6 +124,54 @@ async fn without_a_good_token_only_health_is_answered() {
 }
 
 #[tokio::test]
+async fn those_who_show_no_token_take_a_share_of_the_connections_alone() {
+    let authority = Authority::new();
+    let secret = authority.token("alice", &[Scope::Act], &Quotas::default());
+    let door = DoorConfig {
+        max_connections: 8,
+        handshake_timeout: Duration::from_millis(300),
+        idle_timeout: Duration::from_mins(10),
+        ..authority.tokens()
+    };
+    let server = EnvServer::with(behind(door));
+    let known = channel(&server.address()).await.expect("a channel");
+    list_with(known.clone(), &secret).await.expect("lists");
+    let watch = async |channel: Channel| {
+        let mut watched = HealthClient::new(channel).watch(HealthCheckRequest::default()).await?.into_inner();
+        watched.message().await?;
+        Ok::<_, Status>(watched)
+    };
+    let mut of_alice = watch(known.clone()).await.expect("health");
+    let mut strangers = Vec::new();
+    for _ in 0..7 {
+        let stranger = channel(&server.address()).await.expect("a channel");
+        strangers.push(watch(stranger).await.expect("health is open"));
+    }
+    // The oldest go first; so many as may stay do.
+    let stay = strangers.split_off(5);
+    for mut stranger in strangers {
+        let ended = tokio::time::timeout(Duration::from_secs(10), stranger.message()).await.expect("it is told to go");
+        refused(ended, Code::Unavailable);
+    }
+    let another = async {
+        loop {
+            if let Ok(another) = channel(&server.address()).await
+                && list_with(another, &secret).await.is_ok()
+            {
+                return;
+            }
+            sleep(Duration::from_millis(50)).await;
+        }
+    };
+    tokio::time::timeout(Duration::from_secs(10), another).await.expect("there is room for who has a token");
+    for mut stays in stay {
+        tokio::time::timeout(Duration::from_millis(100), stays.message()).await.expect_err("it goes on");
+    }
+    tokio::time::timeout(Duration::from_millis(100), of_alice.message()).await.expect_err("it goes on");
+    list_with(known, &secret).await.expect("lists");
+}
+
+#[tokio::test]
 async fn a_token_that_is_taken_out_is_refused_and_its_streams_end() {
     let authority = Authority::new();
     let alice = authority.token("alice", &[Scope::Act], &Quotas::default());

@@ -4,8 +4,14 @@ use mazeway_client::{Connection, Env, Learner, SessionOptions};
 use mazeway_proto::{
     env::{self as env_pb, environment_service_client::EnvironmentServiceClient},
     learner as pb,
+    raw::Raw,
 };
-use mazeway_tests::{learner::trajectory, programs::program};
+use mazeway_serving::grant::{Quotas, Scope};
+use mazeway_tests::{
+    authority::{Authority, bearing},
+    learner::trajectory,
+    programs::program,
+};
 use opentelemetry_proto::tonic::{
     collector::trace::v1::{
         ExportTraceServiceRequest, ExportTraceServiceResponse,
@@ -15,11 +21,12 @@ use opentelemetry_proto::tonic::{
     trace::v1::Span,
 };
 use std::{
+    collections::BTreeSet,
     io::{BufRead as _, BufReader, Read as _, Write as _},
     net::TcpStream,
     process::{Child, Command, Stdio},
     sync::{Arc, Mutex},
-    time::Duration,
+    time::{Duration, Instant},
 };
 use tokio_stream::wrappers::TcpListenerStream;
 use tonic::{Code, Request, Response, Status, transport::Server};
@@ -86,6 +93,43 @@ impl Drop for Shown {
     }
 }
 
+/// A frame of HTTP/2.
+fn frame(kind: u8, flags: u8, stream: u32, payload: &[u8]) -> Vec<u8> {
+    let length = u32::try_from(payload.len()).expect("a short one").to_be_bytes();
+    [&length[1..], &[kind, flags], &stream.to_be_bytes(), payload].concat()
+}
+
+/// The head of a call; its body is still to come.
+fn head(stream: u32, path: &str, metadata: &[(&str, &str)]) -> Vec<u8> {
+    let text = |text: &str| [&[u8::try_from(text.len()).expect("a short one")], text.as_bytes()].concat();
+    // POST, http and the names of the path and the content type are known to HPACK.
+    let mut fields = vec![0x83, 0x86, 0x04];
+    fields.extend(text(path));
+    fields.extend([0x0f, 0x10]);
+    fields.extend(text("application/grpc"));
+    for (name, value) in metadata {
+        fields.push(0);
+        fields.extend(text(name));
+        fields.extend(text(value));
+    }
+    frame(1, 4, stream, &fields)
+}
+
+/// A connection on which so much was sent and read by the service.
+fn greeted(address: &str, frames: &[u8]) -> TcpStream {
+    let mut stream = TcpStream::connect(address).expect("connects");
+    stream.set_read_timeout(Some(Duration::from_secs(20))).expect("a time");
+    let sent = [b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n", &frame(4, 0, 0, &[])[..], frames, &frame(6, 0, 0, b"anybody?")];
+    stream.write_all(&sent.concat()).expect("sends");
+    let (mut heard, mut bytes) = (Vec::<u8>::new(), [0; 4096]);
+    while !heard.windows(8).any(|window| window == b"anybody?") {
+        let read = stream.read(&mut bytes).expect("an answer");
+        assert!(read > 0, "it is closed");
+        heard.extend(&bytes[..read]);
+    }
+    stream
+}
+
 fn request_id(status: &Status) -> String {
     status.get_details_request_info().expect("the request's name among the details").request_id
 }
@@ -94,6 +138,16 @@ fn request_id(status: &Status) -> String {
 async fn a_server_counts_what_it_does() {
     let server = Shown::server(&["--max-sessions", "2"]);
     assert_eq!(server.get("/healthz").0, "HTTP/1.0 200 OK");
+    // What can be refused is there from the start, so that the first time is seen to grow.
+    for name in [
+        "mazeway_server_connections_refused_total",
+        "mazeway_server_sessions_refused_total{reason=\"sessions\"}",
+        "mazeway_server_sessions_refused_total{reason=\"environments\"}",
+        "mazeway_server_sessions_refused_total{reason=\"stopping\"}",
+        "mazeway_server_calls_total{method=\"mazeway.env.v1.EnvironmentService/Step\",code=\"INTERNAL\"}",
+    ] {
+        assert_eq!(server.number(name), 0.0, "{name}");
+    }
     let connection = Connection::open(&server.address).await.expect("connects");
     let create = || Env::create(&connection, "Maze-v0", SessionOptions::default());
     let mut env = create().await.expect("a session");
@@ -137,6 +191,85 @@ async fn a_server_counts_what_it_does() {
     assert_eq!(server.number("mazeway_server_calls_total{method=\"other\",code=\"UNIMPLEMENTED\"}"), 50.0);
     assert!(!server.get("/metrics").1.contains("no.such"));
     assert!(server.get("/else").0.contains("404"));
+    let (_, text) = server.get("/metrics");
+    assert!(!text.contains("e+308") && text.contains("step_seconds_bucket{le=\"+Inf\"} 100\n"), "{text}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn whatever_paths_strangers_ask_for_numbers_stay_few() {
+    let authority = Authority::new();
+    let secret = authority.token("alice", &[Scope::Act], &Quotas::default());
+    let server = Shown::server(&["--tokens", authority.path("tokens.toml").to_str().expect("a path")]);
+    let bearer = format!("Bearer {secret}");
+    let tokenless: &[_] = &[];
+    let untimely: &[_] = &[("authorization", bearer.as_str()), ("grpc-timeout", "nonsense")];
+    let given_up: &[_] = &[("authorization", bearer.as_str())];
+    let ask = |paths: std::ops::Range<u32>| {
+        let mut frames = Vec::new();
+        for (number, path) in paths.enumerate() {
+            let path = match path % 4 {
+                0 => format!("/mazeway.env.v1.EnvironmentService/Method{path}"),
+                1 => format!("/grpc.health.v1.Health/Method{path}"),
+                2 => format!("//service{path}/Method/Method"),
+                _ => format!("/service{path}/Method"),
+            };
+            for (kind, metadata) in [tokenless, untimely, given_up].into_iter().enumerate() {
+                let stream = u32::try_from(6 * number + 2 * kind + 1).expect("a short one");
+                frames.extend(head(stream, &path, metadata));
+                if kind == 2 {
+                    frames.extend(frame(3, 0, stream, &8_u32.to_be_bytes()));
+                }
+            }
+        }
+        greeted(&server.address, &frames);
+    };
+    // Once all of them are counted: what methods there are, and how many lines.
+    let series = |calls: f64| {
+        let begun = Instant::now();
+        loop {
+            let (_, text) = server.get("/metrics");
+            let line = |line: &&str| line.starts_with("mazeway_server_calls_total{method=\"other\",");
+            let counted = text.lines().filter(line).map(|line| line.rsplit_once(' ').expect("a number").1);
+            let counted: f64 = counted.map(|number| number.parse::<f64>().expect("a number")).sum();
+            if counted == calls {
+                let methods =
+                    text.split("method=\"").skip(1).map(|rest| rest.split('"').next().expect("a name").to_owned());
+                return (methods.collect::<BTreeSet<_>>(), text.lines().count());
+            }
+            assert!(counted < calls && begun.elapsed() < Duration::from_secs(20), "{counted} of {calls} in\n{text}");
+            std::thread::sleep(Duration::from_millis(20));
+        }
+    };
+    ask(0..8);
+    let (methods, lines) = series(24.0);
+    for ten in 1..101 {
+        ask(10 * ten..10 * ten + 10);
+    }
+    let after = series(3024.0);
+    assert_eq!(after.0, methods);
+    // A call that is given up has ended before that was heard, or not.
+    assert!(after.1 <= lines + 2, "{} lines became {}", lines, after.1);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn half_requests_for_numbers_are_cut_off_and_hold_up_nobody() {
+    let server = Shown::server(&[]);
+    let mut halves = Vec::new();
+    let begun = Instant::now();
+    for _ in 0..300 {
+        let mut half = TcpStream::connect(&server.metrics).expect("connects");
+        half.write_all(b"GET /metrics HT").expect("asks");
+        halves.push(half);
+    }
+    assert!(server.get("/metrics").0.contains("200"));
+    assert!(begun.elapsed() < Duration::from_secs(2), "{:?}", begun.elapsed());
+    for mut half in halves {
+        let left = Duration::from_secs(10).checked_sub(begun.elapsed()).expect("an end of all in time");
+        half.set_read_timeout(Some(left.max(Duration::from_millis(1)))).expect("a time");
+        // A short word of why, or none, or a reset.
+        let end = half.read_to_end(&mut Vec::new());
+        assert!(!end.is_err_and(|error| error.kind() == std::io::ErrorKind::WouldBlock), "it is still there");
+    }
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -357,4 +490,142 @@ fn wrong_flags_are_refused_before_anything_starts() {
     let output = output.expect("runs");
     assert_eq!(output.status.code(), Some(1));
     assert!(String::from_utf8_lossy(&output.stderr).contains(&address));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_cannot_be_decoded_is_the_callers_fault() {
+    let server = Shown::server(&[]);
+    let data = tempfile::tempdir().expect("a directory");
+    let mut command = Command::new(program("learner"));
+    command.args(["serve", "--data"]).arg(data.path());
+    let learner = Shown::start(command);
+    let services = [
+        (&server, "mazeway_server", "mazeway.env.v1.EnvironmentService", ["Step", "Interact", "Rollout"]),
+        (
+            &learner,
+            "mazeway_learner",
+            "mazeway.learner.v1.LearnerService",
+            ["GetFit", "RecordTrajectories", "PutModel"],
+        ),
+    ];
+    for (shown, prefix, service, methods) in services {
+        let mut client = tonic::client::Grpc::new(mazeway_client::channel(&shown.address).await.expect("connects"));
+        for method in methods {
+            client.ready().await.expect("ready");
+            let path = format!("/{service}/{method}").parse().expect("a path");
+            let requests = Request::new(tokio_stream::iter([bytes::Bytes::from_static(&[0x0a, 0xff])]));
+            let status = match client.streaming(requests, path, Raw).await {
+                Ok(answers) => answers.into_inner().message().await.expect_err("it is refused"),
+                Err(status) => status,
+            };
+            assert_eq!(status.code(), Code::InvalidArgument, "{method}: {status}");
+            assert!(status.message().starts_with("failed to decode"), "{method}: {status}");
+            assert!(!request_id(&status).is_empty());
+            let name = |code| format!("{prefix}_calls_total{{method=\"{service}/{method}\",code=\"{code}\"}}");
+            assert_eq!(shown.number(&name("INVALID_ARGUMENT")), 1.0);
+            assert_eq!(shown.number(&name("INTERNAL")), 0.0);
+        }
+        // In the middle of a message, the caller hangs up.
+        let method = methods[1];
+        for _ in 0..5 {
+            let half = frame(0, 0, 1, &[0, 0, 0, 0, 9, 0x0a]);
+            drop(greeted(&shown.address, &[head(1, &format!("/{service}/{method}"), &[]), half].concat()));
+        }
+        let cancelled = format!("{prefix}_calls_total{{method=\"{service}/{method}\",code=\"CANCELLED\"}} 5");
+        let begun = Instant::now();
+        while !shown.get("/metrics").1.lines().any(|line| line == cancelled) {
+            let (_, text) = shown.get("/metrics");
+            assert!(begun.elapsed() < Duration::from_secs(10), "no {cancelled} in\n{text}");
+            tokio::time::sleep(Duration::from_millis(50)).await;
+        }
+        assert_eq!(
+            shown.number(&format!("{prefix}_calls_total{{method=\"{service}/{method}\",code=\"UNKNOWN\"}}")),
+            0.0
+        );
+    }
+    for log in [server.stop(), learner.stop()] {
+        assert!(log.is_empty(), "{log}");
+    }
+}
+
+/// The objects of a log.
+fn lines(log: &str) -> Vec<serde_json::Value> {
+    log.lines().map(|line| serde_json::from_str(line).unwrap_or_else(|_| panic!("no object: {line}"))).collect()
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_stream_that_is_ended_from_outside_is_named_in_the_log() {
+    let authority = Authority::new();
+    let alice = authority.token("alice", &[Scope::Act], &Quotas::default());
+    let file = std::fs::read_to_string(authority.path("tokens.toml")).expect("a file");
+    let bob = authority.token("bob", &[Scope::Act], &Quotas::default());
+    let tokens = authority.path("tokens.toml");
+    let arguments = ["--log-format", "json", "--log", "info", "--stall-timeout-secs", "0.5", "--tokens"];
+    let server = Shown::server(&[&arguments[..], &[tokens.to_str().expect("a path")]].concat());
+    let channel = mazeway_client::channel(&server.address).await.expect("connects");
+    let mut of_bob = EnvironmentServiceClient::new(bearing(channel.clone(), &bob));
+    let mut request = Request::new(tokio_stream::pending());
+    request.metadata_mut().insert("x-request-id", "revoked-1".parse().expect("a value"));
+    let mut revoked = of_bob.interact(request).await.expect("a stream").into_inner();
+    let mut of_alice = EnvironmentServiceClient::new(bearing(channel, &alice));
+    let mut request = Request::new(env_pb::RolloutRequest {
+        env_id: "Maze-v0".into(),
+        controller: Some(env_pb::rollout_request::Controller::Driver("random".into())),
+        episodes: 1_000_000,
+        steps: 100,
+        ..Default::default()
+    });
+    request.metadata_mut().insert("x-request-id", "unread-1".parse().expect("a value"));
+    let unread = of_alice.rollout(request).await.expect("a stream");
+    std::fs::write(&tokens, file).expect("writes");
+    revoked.message().await.expect_err("it is ended");
+    tokio::time::sleep(Duration::from_secs(2)).await;
+    drop(unread);
+    let log = server.stop();
+    for (message, id, method, caller) in [
+        ("a call whose token holds no more is ended", "revoked-1", "Interact", "bob"),
+        ("a stream that nobody reads is ended", "unread-1", "Rollout", "alice"),
+    ] {
+        let lines = lines(&log);
+        let line = lines.iter().find(|line| line["message"] == message).unwrap_or_else(|| panic!("{message}: {log}"));
+        let span = &line["span"];
+        assert_eq!(
+            (&span["request_id"], &span["rpc.method"], &span["caller"]),
+            (&id.into(), &method.into(), &caller.into())
+        );
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_service_says_when_it_begins_and_ends_and_no_health_stream_holds_it_up() {
+    let authority = Authority::new();
+    authority.token("alice", &[Scope::Act], &Quotas::default());
+    let tokens = authority.path("tokens.toml");
+    let server =
+        Shown::server(&["--log", "info", "--shutdown-grace-secs", "20", "--tokens", tokens.to_str().expect("a path")]);
+    let data = tempfile::tempdir().expect("a directory");
+    let mut command = Command::new(program("learner"));
+    command.args(["serve", "--log", "info", "--shutdown-grace", "20s", "--data"]).arg(data.path());
+    let learner = Shown::start(command);
+    for (shown, auth) in [(server, "tokens"), (learner, "nobody")] {
+        let address = shown.address.clone();
+        let mut health = HealthClient::new(mazeway_client::channel(&address).await.expect("connects"));
+        let mut watched = health.watch(HealthCheckRequest::default()).await.expect("health").into_inner();
+        let first = watched.message().await.expect("health").map(|answer| answer.status());
+        assert_eq!(first, Some(ServingStatus::Serving));
+        let begun = Instant::now();
+        let stopping = std::thread::spawn(move || shown.stop());
+        let last = watched.message().await.expect("health").map(|answer| answer.status());
+        assert_eq!(last, Some(ServingStatus::NotServing));
+        let status = watched.message().await.expect_err("it is ended");
+        assert_eq!(status.code(), Code::Unavailable, "{status}");
+        let log = stopping.join().expect("an end");
+        assert!(begun.elapsed() < Duration::from_secs(10), "{:?}", begun.elapsed());
+        assert!(!log.contains('\x1b'), "no colours where nobody sees them: {log:?}");
+        let told: Vec<_> = log.lines().filter(|line| line.contains("the service ")).collect();
+        assert_eq!(told.len(), 3, "{log}");
+        assert!(told[0].contains("takes calls") && told[0].contains(&address), "{log}");
+        assert!(told[0].contains("tls=false") && told[0].contains(auth), "{log}");
+        assert!(told[1].contains("told to stop") && told[2].contains("has stopped"), "{log}");
+    }
 }

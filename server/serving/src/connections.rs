@@ -46,6 +46,9 @@ impl Gate {
         telemetry.read("connections", "Connections that are open", move || {
             free.upgrade().map_or(0, |places| all.saturating_sub(places.available_permits()) as i64)
         });
+        if let Ok(address) = listener.address() {
+            telemetry.life.listens(address);
+        }
         Self { listener, numbers: telemetry.connections.clone(), places, max }
     }
 
@@ -97,6 +100,9 @@ impl Drop for Counted {
     }
 }
 
+/// What begins every connection of HTTP/2, in bytes.
+const PREFACE_BYTES: usize = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n".len();
+
 /// The bytes of a connection, encrypted or not.
 #[derive(Debug)]
 enum Bytes {
@@ -108,21 +114,21 @@ enum Bytes {
 #[derive(Debug)]
 pub struct Connection {
     bytes: Bytes,
-    /// Told of the first byte that comes, and no more.
-    spoken: Option<Arc<AtomicBool>>,
+    /// How much of the preface is still to come, and who is told once it is there.
+    spoken: Option<(usize, Arc<AtomicBool>)>,
     /// How long the peer may take to end, once we have.
     linger: Option<Pin<Box<Sleep>>>,
 }
 
 impl Connection {
-    /// A connection that is not encrypted. `spoken` becomes true with the first byte from the peer.
+    /// A connection that is not encrypted. `spoken` becomes true once the peer has sent a whole preface.
     pub fn plain(socket: Socket, spoken: Arc<AtomicBool>) -> Self {
-        Self { bytes: Bytes::Plain(socket), spoken: Some(spoken), linger: None }
+        Self { bytes: Bytes::Plain(socket), spoken: Some((PREFACE_BYTES, spoken)), linger: None }
     }
 
     /// A connection whose handshake is done.
     pub fn tls(stream: TlsStream<Socket>, spoken: Arc<AtomicBool>) -> Self {
-        Self { bytes: Bytes::Tls(Box::new(stream)), spoken: Some(spoken), linger: None }
+        Self { bytes: Bytes::Tls(Box::new(stream)), spoken: Some((PREFACE_BYTES, spoken)), linger: None }
     }
 }
 
@@ -133,11 +139,12 @@ impl AsyncRead for Connection {
             Bytes::Plain(socket) => Pin::new(socket).poll_read(cx, buf),
             Bytes::Tls(stream) => Pin::new(stream).poll_read(cx, buf),
         };
-        if self.spoken.is_some()
-            && buf.filled().len() > before
-            && let Some(spoken) = self.spoken.take()
-        {
-            spoken.store(true, Ordering::Relaxed);
+        if let Some((missing, spoken)) = &mut self.spoken {
+            *missing = missing.saturating_sub(buf.filled().len() - before);
+            if *missing == 0 {
+                spoken.store(true, Ordering::Relaxed);
+                self.spoken = None;
+            }
         }
         read
     }

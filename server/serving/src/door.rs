@@ -1,7 +1,8 @@
 //! The door: who calls is found out once a call, what the call needs is looked up, and its deadline is kept.
 //!
 //! Invariants: no part of a service sees a request before its caller is known and may make it; the secret goes no further
-//! than this; an answer that a deadline cuts off gives back what it holds before the caller hears of it.
+//! than this; an answer that a deadline cuts off gives back what it holds before the caller hears of it; a caller who goes
+//! in the middle of its request has cancelled its call, whatever the service makes of what came.
 
 use crate::{
     caller::Caller,
@@ -9,10 +10,10 @@ use crate::{
     keyring::Keyring,
     rules::{Need, Rule, Rules, common},
     telemetry::{
-        Telemetry,
+        Life, Telemetry,
         calls::{Calls, Observed},
     },
-    watch::{Call, Visit, Watch},
+    watch::{Call, Fate, Standing, Visit, Watch},
 };
 use bytes::Bytes;
 use http::{HeaderMap, Request, Response, header::AUTHORIZATION};
@@ -26,6 +27,7 @@ use std::{
     time::{Duration, SystemTime},
 };
 use tokio::time::{Instant, Sleep, sleep_until, timeout_at};
+use tokio_util::sync::WaitForCancellationFutureOwned;
 use tonic::{Status, body::Body, service::Routes};
 use tower::ServiceExt as _;
 use tracing::Instrument as _;
@@ -48,6 +50,14 @@ pub struct Door {
     /// Who and what is inside.
     pub watch: Arc<Watch>,
     calls: Calls,
+    life: Arc<Life>,
+}
+
+impl Drop for Door {
+    fn drop(&mut self) {
+        // Whoever is inside holds it.
+        self.life.ended();
+    }
 }
 
 impl Door {
@@ -56,8 +66,11 @@ impl Door {
     /// # Errors
     /// The file of tokens does not serve.
     pub fn new(config: &DoorConfig, rules: Rules, telemetry: &Telemetry) -> Result<Self, DoorError> {
+        let keyring = config.keyring()?;
+        telemetry.calls.serve(rules);
+        telemetry.life.asks(config);
         Ok(Self {
-            keyring: config.keyring()?,
+            keyring,
             mutual: config.tls_client_ca.is_some(),
             rules,
             open_reflection: config.open_reflection,
@@ -65,6 +78,7 @@ impl Door {
             max_call_deadline: config.max_call_deadline,
             watch: Watch::new(config),
             calls: telemetry.calls.clone(),
+            life: Arc::clone(&telemetry.life),
         })
     }
 
@@ -139,13 +153,19 @@ impl Entrance {
         Self { door, visit, routes }
     }
 
-    fn enter(&self, request: &mut Request<Incoming>) -> Result<(Caller, Option<Instant>, bool), Status> {
+    fn enter(&self, request: &mut Request<Incoming>) -> Result<Entered, Status> {
         if self.visit.holds_too_much() {
             return Err(Status::resource_exhausted(
                 "expected the answers of this connection to be read before further calls",
             ));
         }
         let rule = self.door.rule(request.uri().path());
+        let open = rule.need == Need::Nothing;
+        if open && self.visit.has_enough_open_calls() {
+            return Err(Status::resource_exhausted(
+                "expected calls that need no token to end before there are more on this connection",
+            ));
+        }
         let caller = self.door.admit(rule, request.uri().path(), request.headers(), &self.visit)?;
         request.headers_mut().remove(AUTHORIZATION);
         let asked = asked_time(request.headers())?;
@@ -154,8 +174,18 @@ impl Entrance {
             (false, None) => Some(self.door.call_deadline.min(self.door.max_call_deadline)),
             (false, Some(asked)) => Some(asked.min(self.door.max_call_deadline)),
         };
-        Ok((caller, allowed.map(|allowed| Instant::now() + allowed.min(FAR)), rule.streams))
+        let deadline = allowed.map(|allowed| Instant::now() + allowed.min(FAR));
+        Ok(Entered { caller, deadline, streams: rule.streams, open })
     }
+}
+
+/// How a call was let in.
+struct Entered {
+    caller: Caller,
+    deadline: Option<Instant>,
+    streams: bool,
+    /// It needs nothing.
+    open: bool,
 }
 
 impl hyper::service::Service<Request<Incoming>> for Entrance {
@@ -166,9 +196,13 @@ impl hyper::service::Service<Request<Incoming>> for Entrance {
     fn call(&self, mut request: Request<Incoming>) -> Self::Future {
         let observed = self.door.calls.begin(&request);
         let entered = self.enter(&mut request);
-        let caller = entered.as_ref().map_or_else(|_| Caller::anybody(), |(caller, ..)| caller.clone());
-        let call = self.visit.call(caller);
-        let (caller, deadline, streams) = match entered {
+        let (caller, standing) = match &entered {
+            Ok(Entered { open: true, .. }) => (Caller::anybody(), Standing::Open),
+            Ok(Entered { caller, .. }) => (caller.clone(), Standing::Admitted),
+            Err(_) => (Caller::anybody(), Standing::Refused),
+        };
+        let call = self.visit.call(caller, standing, observed.span().clone());
+        let Entered { caller, deadline, streams, open } = match entered {
             Ok(entered) => entered,
             Err(status) => {
                 let response = status.into_http::<Body>().map(|body| Answer::new(body, call, None));
@@ -177,18 +211,72 @@ impl hyper::service::Service<Request<Incoming>> for Entrance {
         };
         observed.by(&caller);
         request.extensions_mut().insert(caller);
-        let answering = self.routes.clone().oneshot(request.map(Body::new)).instrument(observed.span().clone());
+        let request = request.map(|body| Body::new(Asked { body, fate: Arc::clone(call.fate()) }));
+        let answering = self.routes.clone().oneshot(request).instrument(observed.span().clone());
+        let leave = open.then(|| self.visit.leave().clone());
         Box::pin(async move {
-            let response = match deadline {
-                None => answering.await?,
-                Some(deadline) => match timeout_at(deadline, answering).await {
-                    Ok(response) => response?,
-                    Err(_) => too_late().into_http(),
+            let in_time = async {
+                match deadline {
+                    None => answering.await,
+                    Some(deadline) => match timeout_at(deadline, answering).await {
+                        Ok(response) => response,
+                        Err(_) => Ok(too_late().into_http()),
+                    },
+                }
+            };
+            let mut response = match &leave {
+                None => in_time.await?,
+                Some(leave) => tokio::select! {
+                    biased;
+                    response = in_time => response?,
+                    () = leave.cancelled() => closing().into_http(),
                 },
             };
-            Ok(observed.answer(response.map(|body| Answer::new(body, call, deadline.filter(|_| streams)))))
+            if call.fate().is_gone() && response.headers().contains_key("grpc-status") {
+                response = gone().into_http();
+            }
+            Ok(observed.answer(response.map(|body| {
+                let mut answer = Answer::new(body, call, deadline.filter(|_| streams));
+                answer.leave = leave.map(|leave| Box::pin(leave.cancelled_owned()));
+                answer
+            })))
         })
     }
+}
+
+/// The body of a request; notes that its sender has gone before its end.
+struct Asked {
+    body: Incoming,
+    fate: Arc<Fate>,
+}
+
+impl http_body::Body for Asked {
+    type Data = Bytes;
+    type Error = hyper::Error;
+
+    fn poll_frame(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Option<Result<Frame<Bytes>, hyper::Error>>> {
+        let polled = Pin::new(&mut self.body).poll_frame(cx);
+        if let Poll::Ready(Some(Err(_))) = &polled {
+            self.fate.goes();
+        }
+        polled
+    }
+
+    fn is_end_stream(&self) -> bool {
+        self.body.is_end_stream()
+    }
+
+    fn size_hint(&self) -> SizeHint {
+        self.body.size_hint()
+    }
+}
+
+fn gone() -> Status {
+    Status::cancelled("the caller has gone in the middle of its request")
+}
+
+fn closing() -> Status {
+    Status::unavailable("this connection is closing; ask again on another")
 }
 
 fn too_late() -> Status {
@@ -227,6 +315,8 @@ pub struct Answer {
     rest: Bytes,
     call: Arc<Call>,
     deadline: Option<Pin<Box<Sleep>>>,
+    /// For a call that needs nothing: its connection is told to go, and it ends before.
+    leave: Option<Pin<Box<WaitForCancellationFutureOwned>>>,
 }
 
 impl Answer {
@@ -234,7 +324,8 @@ impl Answer {
         if body.is_end_stream() {
             call.completes();
         }
-        Self { body, rest: Bytes::new(), call, deadline: deadline.map(|deadline| Box::pin(sleep_until(deadline))) }
+        let deadline = deadline.map(|deadline| Box::pin(sleep_until(deadline)));
+        Self { body, rest: Bytes::new(), call, deadline, leave: None }
     }
 }
 
@@ -247,12 +338,7 @@ impl http_body::Body for Answer {
         if let Some(deadline) = &mut this.deadline
             && deadline.as_mut().poll(cx).is_ready()
         {
-            this.body = Body::empty();
-            this.forget();
-            this.deadline = None;
-            this.call.completes();
-            let mut trailers = HeaderMap::with_capacity(2);
-            return Poll::Ready(Some(too_late().add_header(&mut trailers).map(|()| Frame::trailers(trailers))));
+            return Poll::Ready(Some(this.cut(&too_late())));
         }
         if !this.rest.is_empty() {
             let rest = std::mem::take(&mut this.rest);
@@ -260,7 +346,15 @@ impl http_body::Body for Answer {
         }
         let polled = Pin::new(&mut this.body).poll_frame(cx);
         match polled {
-            Poll::Pending => this.call.waits(),
+            Poll::Pending => {
+                // What it had to say comes first.
+                if let Some(leave) = &mut this.leave
+                    && leave.as_mut().poll(cx).is_ready()
+                {
+                    return Poll::Ready(Some(this.cut(&closing())));
+                }
+                this.call.waits();
+            }
             Poll::Ready(Some(Ok(frame))) if frame.is_data() => {
                 this.call.took();
                 return Poll::Ready(Some(match frame.into_data() {
@@ -272,6 +366,7 @@ impl http_body::Body for Answer {
                     Err(frame) => Ok(frame),
                 }));
             }
+            Poll::Ready(Some(_)) if this.call.fate().is_gone() => return Poll::Ready(Some(this.cut(&gone()))),
             Poll::Ready(_) => this.call.completes(),
         }
         polled
@@ -295,6 +390,16 @@ impl Answer {
         self.call.visit().gives(slice.len());
         self.rest = bytes;
         Frame::data(slice)
+    }
+
+    /// Ends it with a status, whatever there still was.
+    fn cut(&mut self, status: &Status) -> Result<Frame<Bytes>, Status> {
+        self.body = Body::empty();
+        self.forget();
+        (self.deadline, self.leave) = (None, None);
+        self.call.completes();
+        let mut trailers = HeaderMap::with_capacity(2);
+        status.add_header(&mut trailers).map(|()| Frame::trailers(trailers))
     }
 
     /// Forgets what is left.

@@ -38,6 +38,14 @@ impl Rule {
 /// that lets nobody in.
 pub type Rules = fn(&str) -> Rule;
 
+/// Health and reflection, which every service has, as gRPC writes methods.
+pub const COMMON: [&str; 4] = [
+    "grpc.health.v1.Health/Check",
+    "grpc.health.v1.Health/Watch",
+    "grpc.reflection.v1.ServerReflection/ServerReflectionInfo",
+    "grpc.reflection.v1alpha.ServerReflection/ServerReflectionInfo",
+];
+
 /// Health, which is open, and reflection, which needs a token unless it is `open`; `None` for every other path.
 pub fn common(path: &str, open_reflection: bool) -> Option<Rule> {
     let (service, method) = path.strip_prefix('/')?.split_once('/')?;

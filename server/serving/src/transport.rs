@@ -94,6 +94,8 @@ impl Transport {
                     return;
                 }
                 http.as_mut().graceful_shutdown();
+                // Where the service goes on, nothing was under way: a peer that does not leave need not be waited for so long.
+                let grace = if stopping.is_cancelled() { grace } else { grace.min(self.handshake_timeout) };
                 // Calls that need longer are cut off.
                 timeout(grace, http).await.unwrap_or(Ok(()))
             }

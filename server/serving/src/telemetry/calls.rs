@@ -3,15 +3,17 @@
 //! The name of a call, its request id, goes into its span, into the metadata of its answer and into the details of its error. A
 //! call lasts until the last byte of its answer is handed on, or its caller has gone, which counts as CANCELLED.
 //!
-//! Invariants: a message that passes costs no more than a look at whether it is the last; labels come from the service, never
-//! from a client.
+//! Invariants: a message that passes costs no more than a look at whether it is the last; labels and names of spans come
+//! from the methods that are served, never from a client. What the transport's decoder blames on the service although the
+//! request was none is blamed on the caller here.
 
 use super::{
     Telemetry,
+    methods::{Methods, OTHER},
     numbers::{Counter, Times},
     request_id,
 };
-use crate::caller::Caller;
+use crate::{caller::Caller, rules::Rules};
 use bytes::Bytes;
 use http::{HeaderMap, HeaderValue, Request, Response};
 use http_body::{Body as HttpBody, Frame, SizeHint};
@@ -23,7 +25,7 @@ use prometheus_client::{
 };
 use std::{
     pin::Pin,
-    sync::Arc,
+    sync::{Arc, OnceLock},
     task::{Context, Poll},
     time::Instant,
 };
@@ -77,6 +79,19 @@ fn name(code: Code) -> &'static str {
     }
 }
 
+/// Codes that tell of a fault of the service: shown from the start, so that the first of them is seen to come.
+const FAULTS: [Code; 3] = [Code::Internal, Code::DataLoss, Code::Unknown];
+/// Longest part of a path that is no method's in a span, in bytes.
+const MAX_PART_BYTES: usize = 64;
+/// What the transport's decoder says, under INTERNAL, of requests that are none.
+const UNDECODABLE: [&str; 5] = [
+    "failed to decode Protobuf message",
+    "protocol error: received message with ",
+    "Error decompressing: ",
+    "Unexpected EOF decoding stream",
+    "Missing request message",
+];
+
 #[derive(Debug, Clone, Copy, Default)]
 struct OfCalls;
 
@@ -89,6 +104,8 @@ impl MetricConstructor<Times> for OfCalls {
 /// Calls, counted and timed. Cloning shares it.
 #[derive(Debug, Clone)]
 pub struct Calls {
+    methods: Arc<OnceLock<Methods>>,
+    other: Arc<str>,
     ended: Family<EndLabel, Counter>,
     took: Family<MethodLabel, Times, OfCalls>,
     begun: Counter,
@@ -98,6 +115,8 @@ pub struct Calls {
 impl Default for Calls {
     fn default() -> Self {
         Self {
+            methods: Arc::default(),
+            other: OTHER.into(),
             ended: Family::default(),
             took: Family::new_with_constructor(OfCalls),
             begun: Counter::default(),
@@ -115,20 +134,35 @@ impl Calls {
             .read("calls_open", "Calls and streams under way", move || begun.get().saturating_sub(over.get()) as i64);
     }
 
+    /// Whatever has a rule among these is counted by its name; before this is told, nothing is.
+    pub fn serve(&self, rules: Rules) {
+        let methods = self.methods.get_or_init(|| Methods::served(rules));
+        for method in methods.iter() {
+            for code in FAULTS {
+                drop(self.ended.get_or_create(&EndLabel { method: Arc::clone(method), code: CodeLabel(code) }));
+            }
+        }
+    }
+
     /// Takes note of a call that begins.
     pub fn begin<T>(&self, request: &Request<T>) -> Call {
         let request_id = request_id::of(request.headers());
-        let path = request.uri().path().trim_start_matches('/');
-        let (service, method) = path.rsplit_once('/').unwrap_or(("", path));
+        let asked = request.uri().path();
+        let known = self.methods.get().and_then(|methods| methods.of(asked));
+        let name = Arc::clone(known.unwrap_or(&self.other));
+        let (service, method) = match known.map(|name| name.rsplit_once('/')) {
+            Some(parts) => parts.unwrap_or_default(),
+            None => asked.rsplit_once('/').map_or(("", asked), |(service, method)| (clipped(service), method)),
+        };
         // At the level of errors, so that whatever is logged of a call carries its name.
         let span = tracing::error_span!(
             "call",
-            otel.name = path,
+            otel.name = &*name,
             otel.kind = "server",
             otel.status_code = field::Empty,
             rpc.system = "grpc",
             rpc.service = service,
-            rpc.method = method,
+            rpc.method = clipped(method),
             rpc.grpc.status_code = field::Empty,
             caller = field::Empty,
             request_id = request_id.to_str().unwrap_or_default(),
@@ -139,8 +173,21 @@ impl Calls {
             let _ = span.set_parent(parent);
         }
         self.begun.add(1);
-        Call { calls: self.clone(), path: path.into(), request_id, span, begun: Instant::now(), ended: false }
+        Call { calls: self.clone(), method: name, request_id, span, begun: Instant::now(), ended: false }
     }
+}
+
+/// What of a path of anybody's is written down.
+fn clipped(part: &str) -> &str {
+    &part[..part.floor_char_boundary(MAX_PART_BYTES)]
+}
+
+/// A status that blames whom it should: a request that cannot be decoded is the caller's fault.
+fn fair(status: Status) -> Status {
+    if status.code() == Code::Internal && UNDECODABLE.iter().any(|begin| status.message().starts_with(begin)) {
+        return Status::with_metadata(Code::InvalidArgument, status.message(), status.metadata().clone());
+    }
+    status
 }
 
 /// W3C trace context among metadata.
@@ -160,7 +207,7 @@ impl Extractor for Carrier<'_> {
 #[derive(Debug)]
 pub struct Call {
     calls: Calls,
-    path: Arc<str>,
+    method: Arc<str>,
     request_id: HeaderValue,
     span: Span,
     begun: Instant,
@@ -193,7 +240,7 @@ impl Call {
 
     /// Takes note of the status among the trailers, and names the call there if it failed.
     fn end(&mut self, trailers: &mut HeaderMap) {
-        let status = Status::from_header_map(trailers).unwrap_or_else(|| Status::unknown("no status"));
+        let status = fair(Status::from_header_map(trailers).unwrap_or_else(|| Status::unknown("no status")));
         self.count(status.code());
         if status.code() == Code::Ok {
             return;
@@ -216,8 +263,7 @@ impl Call {
         }
         let calls = &self.calls;
         calls.over.add(1);
-        let known = code != Code::Unimplemented && !self.path.is_empty();
-        let method: Arc<str> = if known { Arc::clone(&self.path) } else { "other".into() };
+        let method = Arc::clone(&self.method);
         calls.took.get_or_create(&MethodLabel { method: Arc::clone(&method) }).observe(self.begun.elapsed());
         calls.ended.get_or_create(&EndLabel { method, code: CodeLabel(code) }).add(1);
         self.span.record("rpc.grpc.status_code", code as i32);
@@ -291,10 +337,17 @@ impl<B: HttpBody<Data = Bytes, Error = Status> + Unpin> HttpBody for Observed<B>
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::{
+        grant::Scope,
+        rules::{Need, Rule},
+    };
+    use prost::Message as _;
     use tonic::body::Body;
 
+    const METHOD: &str = "mazeway.env.v1.EnvironmentService/Step";
+
     fn request(headers: &[(&'static str, &'static str)]) -> Request<()> {
-        let mut request = Request::builder().uri("/some.Service/Method");
+        let mut request = Request::builder().uri(format!("/{METHOD}"));
         for (key, value) in headers {
             request = request.header(*key, *value);
         }
@@ -304,6 +357,7 @@ mod tests {
     #[test]
     fn a_failed_call_is_named_in_its_details_and_counted_once() {
         let telemetry = Telemetry::new("test");
+        telemetry.calls.serve(|_| Rule::call(Need::Scope(&[Scope::Act])));
         let call = telemetry.calls.begin(&request(&[("x-request-id", "a-1")]));
         let status = Status::with_error_details(Code::NotFound, "nothing", {
             let mut details = ErrorDetails::new();
@@ -320,12 +374,51 @@ mod tests {
         drop(telemetry.calls.begin(&request(&[])));
         let text = telemetry.text().expect("numbers");
         for line in [
-            "test_calls_total{method=\"some.Service/Method\",code=\"NOT_FOUND\"} 1",
-            "test_calls_total{method=\"some.Service/Method\",code=\"CANCELLED\"} 1",
-            "test_call_seconds_count{method=\"some.Service/Method\"} 2",
-            "test_calls_open 0",
+            format!("test_calls_total{{method=\"{METHOD}\",code=\"NOT_FOUND\"}} 1"),
+            format!("test_calls_total{{method=\"{METHOD}\",code=\"CANCELLED\"}} 1"),
+            format!("test_calls_total{{method=\"{METHOD}\",code=\"INTERNAL\"}} 0"),
+            format!("test_call_seconds_count{{method=\"{METHOD}\"}} 2"),
+            "test_calls_open 0".into(),
         ] {
             assert!(text.lines().any(|found| found == line), "{line} in\n{text}");
         }
+    }
+
+    #[test]
+    fn a_path_that_is_no_methods_makes_no_number_however_its_call_ends() {
+        let telemetry = Telemetry::new("test");
+        telemetry.calls.serve(|_| Rule::call(Need::Scope(&[Scope::Act])));
+        let call = |number: u32| {
+            let path = format!("/some{number}.Service/Method");
+            telemetry.calls.begin(&Request::builder().uri(path).body(()).expect("a request"))
+        };
+        let end = |number: u32| {
+            drop(call(number));
+            for code in [Code::Unauthenticated, Code::InvalidArgument, Code::Unimplemented] {
+                drop(call(number).answer(Status::new(code, "no").into_http::<Body>()));
+            }
+        };
+        end(0);
+        let series = || telemetry.text().expect("numbers").lines().count();
+        let before = series();
+        (1..1001).for_each(end);
+        assert_eq!(series(), before);
+        let text = telemetry.text().expect("numbers");
+        assert!(text.contains("test_calls_total{method=\"other\",code=\"CANCELLED\"} 1001\n"), "{text}");
+        assert!(!text.contains("some"), "{text}");
+    }
+
+    #[test]
+    fn a_request_that_is_none_is_its_callers_fault_and_a_fault_of_ours_stays_ours() {
+        let telemetry = Telemetry::new("test");
+        telemetry.calls.serve(|_| Rule::call(Need::Scope(&[Scope::Act])));
+        let answered = |status: Status| {
+            let response = telemetry.calls.begin(&request(&[])).answer(status.into_http::<Body>());
+            Status::from_header_map(response.headers()).expect("a status")
+        };
+        let undecodable = prost_types::Timestamp::decode(&[0xff][..]).expect_err("none").to_string();
+        let status = answered(Status::internal(undecodable.clone()));
+        assert_eq!((status.code(), status.message()), (Code::InvalidArgument, undecodable.as_str()));
+        assert_eq!(answered(Status::internal("internal error")).code(), Code::Internal);
     }
 }

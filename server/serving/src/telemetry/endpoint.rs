@@ -1,13 +1,34 @@
 //! `/metrics` and `/healthz` over HTTP, on a port of their own: who watches a service needs no token for it, and a service
 //! that is full still answers.
+//!
+//! It is bounded all the same: a connection has one request, which must come in time, and where there are too many the
+//! newest takes the place of the oldest. Who asks at once is answered, however many others only listen.
 
 use super::Telemetry;
 use axum::{
     Router, extract::State, http::StatusCode, http::header::CONTENT_TYPE, response::IntoResponse, routing::get,
 };
-use std::{io, net::SocketAddr, sync::Arc};
-use tokio::net::TcpListener;
+use hyper::server::conn::http1;
+use hyper_util::{
+    rt::{TokioIo, TokioTimer},
+    service::TowerToHyperService,
+};
+use std::{collections::VecDeque, io, net::SocketAddr, sync::Arc, time::Duration};
+use tokio::{
+    net::{TcpListener, TcpStream},
+    task::{AbortHandle, JoinSet},
+    time::{sleep, timeout},
+};
 use tokio_util::sync::CancellationToken;
+
+/// Connections at a time.
+const MAX_CONNECTIONS: usize = 64;
+/// Time that a request has to come.
+const ASKING_TIME: Duration = Duration::from_secs(5);
+/// Time that a connection has in all.
+const TIME: Duration = Duration::from_secs(20);
+/// Pause after a connection that could not be taken.
+const PAUSE: Duration = Duration::from_millis(50);
 
 /// The text format of Prometheus.
 const TEXT: &str = "text/plain; version=0.0.4; charset=utf-8";
@@ -24,15 +45,46 @@ pub async fn start(address: SocketAddr, telemetry: Arc<Telemetry>) -> io::Result
     let stopped = stopping.clone().cancelled_owned();
     tokio::spawn(async move {
         tokio::select! {
-            outcome = async { axum::serve(listener, routes).await } => {
-                if let Err(error) = outcome {
-                    tracing::error!(%error, "numbers are no longer shown");
-                }
-            }
+            () = serve(listener, routes) => {}
             () = stopped => {}
         }
     });
     Ok(Endpoint { address, stopping })
+}
+
+async fn serve(listener: TcpListener, routes: Router) {
+    // Whoever is inside goes with this.
+    let mut inside = JoinSet::new();
+    let mut by_age: VecDeque<AbortHandle> = VecDeque::new();
+    loop {
+        let stream = match listener.accept().await {
+            Ok((stream, _)) => stream,
+            Err(error) => {
+                tracing::warn!(%error, "a connection that asks for numbers could not be taken");
+                sleep(PAUSE).await;
+                continue;
+            }
+        };
+        while inside.try_join_next().is_some() {}
+        by_age.retain(|connection| !connection.is_finished());
+        if by_age.len() >= MAX_CONNECTIONS
+            && let Some(oldest) = by_age.pop_front()
+        {
+            oldest.abort();
+        }
+        by_age.push_back(inside.spawn(answer(stream, routes.clone())));
+    }
+}
+
+async fn answer(stream: TcpStream, routes: Router) {
+    let mut http = http1::Builder::new();
+    http.timer(TokioTimer::new()).header_read_timeout(ASKING_TIME).keep_alive(false);
+    let answering = http.serve_connection(TokioIo::new(stream), TowerToHyperService::new(routes));
+    match timeout(TIME, answering).await {
+        Ok(Ok(())) => {}
+        Ok(Err(error)) => tracing::debug!(%error, "numbers were not asked for in time, or not taken"),
+        Err(_) => tracing::debug!("numbers were not taken in time"),
+    }
 }
 
 /// Where the numbers are shown; no longer once it is dropped.

@@ -7,7 +7,11 @@ use super::TelemetryConfig;
 use opentelemetry::{KeyValue, trace::TracerProvider as _};
 use opentelemetry_otlp::{SpanExporter, WithExportConfig as _};
 use opentelemetry_sdk::{Resource, trace::SdkTracerProvider};
-use std::{io, time::Duration};
+use std::{
+    env,
+    io::{self, IsTerminal as _},
+    time::Duration,
+};
 use tracing_subscriber::{
     EnvFilter, Layer as _, Registry, filter::filter_fn, layer::SubscriberExt as _, util::SubscriberInitExt as _,
 };
@@ -67,7 +71,9 @@ pub fn start(config: &TelemetryConfig, service: &'static str) -> io::Result<Span
         Some(filter) => EnvFilter::builder().parse(filter).map_err(io::Error::other)?,
         None => EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("warn")),
     };
-    let writing = tracing_subscriber::fmt::layer().with_writer(io::stderr);
+    // Colours are for eyes; a file or a collector would keep their codes.
+    let coloured = io::stderr().is_terminal() && env::var_os("NO_COLOR").is_none_or(|value| value.is_empty());
+    let writing = tracing_subscriber::fmt::layer().with_writer(io::stderr).with_ansi(coloured);
     let writing = match config.log_format {
         LogFormat::Text => writing.boxed(),
         LogFormat::Json => writing.json().flatten_event(true).boxed(),

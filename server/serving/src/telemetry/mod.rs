@@ -6,12 +6,15 @@
 
 pub mod calls;
 pub mod endpoint;
+mod life;
 pub mod logs;
+mod methods;
 pub mod numbers;
 mod request_id;
 
 use crate::listen::ListenAddress;
 use calls::Calls;
+pub(crate) use life::Life;
 use numbers::{Counter, Growing, Reading};
 use prometheus_client::{
     encoding::prometheus_text,
@@ -19,10 +22,7 @@ use prometheus_client::{
 };
 use std::{
     net::SocketAddr,
-    sync::{
-        LazyLock, Mutex, PoisonError,
-        atomic::{AtomicBool, Ordering::Relaxed},
-    },
+    sync::{Arc, LazyLock, Mutex, PoisonError},
 };
 
 /// What is shown, and where. The same flags for every service.
@@ -79,7 +79,7 @@ pub struct Telemetry {
     pub calls: Calls,
     /// Of connections.
     pub connections: Connections,
-    serving: AtomicBool,
+    pub(crate) life: Arc<Life>,
 }
 
 impl Telemetry {
@@ -89,7 +89,7 @@ impl Telemetry {
             registry: Mutex::new(Registry::with_prefix(prefix)),
             calls: Calls::default(),
             connections: Connections::default(),
-            serving: AtomicBool::new(false),
+            life: Arc::default(),
         };
         telemetry.calls.register(&telemetry);
         let connections = telemetry.connections.clone();
@@ -119,14 +119,14 @@ impl Telemetry {
         self.add(name, help, Growing(read));
     }
 
-    /// Whether the service takes calls. It is told, and says so at `/healthz`.
+    /// Whether the service takes calls. It is told, and says so at `/healthz` and in the log; it never begins twice.
     pub fn set_serving(&self, serving: bool) {
-        self.serving.store(serving, Relaxed);
+        self.life.serves(serving);
     }
 
     /// Whether the service takes calls.
     pub fn is_serving(&self) -> bool {
-        self.serving.load(Relaxed)
+        self.life.is_serving()
     }
 
     /// All numbers, in the text format of Prometheus.

@@ -9,6 +9,7 @@ use mazeway_tests::{
 };
 use std::{
     fs,
+    io::Write as _,
     path::{Path, PathBuf},
     process::Command,
 };
@@ -141,4 +142,61 @@ async fn a_full_disk_loses_nothing_and_is_told() {
     drop(learner);
     server.stop();
     assert!(mazeway_learner::store::verify(disk.path()).is_ok_and(|found| found.is_sound()));
+}
+
+/// All there, as they were, and nothing beside.
+fn same(found: &[pb::Trajectory], expected: &[pb::Trajectory]) {
+    let ids = |all: &[pb::Trajectory]| all.iter().map(|t| t.trajectory_id.clone()).collect::<Vec<_>>();
+    assert_eq!(ids(found), ids(expected));
+    assert!(found == expected);
+}
+
+/// Takes all the room that is left.
+fn fill_up(disk: &SmallDisk) {
+    let mut filler = fs::File::options().create(true).append(true).open(disk.filler()).expect("a file");
+    while filler.write_all(&[b'.'; 4096]).is_ok() {}
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_store_opens_on_a_disk_that_has_filled_up_since_it_was_closed() {
+    let Some(disk) = SmallDisk::mount(8 << 20) else {
+        println!("skipped: nothing can be mounted here");
+        return;
+    };
+    let (_environments, model) = maze().await;
+    let mut acknowledged = Vec::new();
+    {
+        let server = LearnerServer::start(disk.path());
+        let learner = server.client().await;
+        learner.put_model(&model).await.expect("a model");
+        let mut recorder = learner.recorder();
+        for number in 0..20 {
+            recorder.record(large(number, &model.model_id)).await.expect("a trajectory");
+            acknowledged.push(large(number, &model.model_id));
+        }
+        recorder.finish().await.expect("all stored");
+        server.stop();
+    }
+    for _ in 0..3 {
+        fill_up(&disk);
+        assert!(mazeway_learner::store::verify(disk.path()).is_ok_and(|found| found.is_sound()));
+        let server = LearnerServer::start(disk.path());
+        let learner = server.client().await;
+        same(&export(&learner, &pb::TrajectoryFilter::default()).await, &acknowledged);
+        learner.fit(fit(), |_| ()).await.expect("a fit");
+        let (more, error) = fill(&learner, &model.model_id, 100).await;
+        assert_eq!(error.code(), Code::ResourceExhausted, "{error}");
+        // The room that was given up holds some.
+        acknowledged.extend(more.into_iter().filter(|t| !acknowledged.contains(t)).collect::<Vec<_>>());
+        drop(learner);
+        server.stop();
+    }
+    fs::remove_file(disk.filler()).expect("room again");
+    let server = LearnerServer::start(disk.path());
+    let learner = server.client().await;
+    let mut recorder = learner.recorder();
+    recorder.record(large(1_000, &model.model_id)).await.expect("a trajectory");
+    recorder.finish().await.expect("recording resumes");
+    acknowledged.push(large(1_000, &model.model_id));
+    same(&export(&learner, &pb::TrajectoryFilter::default()).await, &acknowledged);
 }

@@ -74,6 +74,27 @@ async fn what_is_damaged_is_said_and_repaired() {
     let (error, hint) = complaint(&damaged);
     assert!(error.ends_with("is damaged: 1 trajectories") && hint.contains("learner repair"), "{error}, {hint}");
     let service = Service::learner(data.path());
+    // All else can be had at once, the service at work or not.
+    let file = data.path().join("exported.jsonl");
+    let out = file.to_str().expect("a path");
+    let stopped = learner(&["export", "--out", out], data.path());
+    assert_eq!(stopped.status.code(), Some(1));
+    assert!(complaint(&stopped).1.contains("--skip-damaged"), "{stopped:?}");
+    assert!(
+        fs::read_dir(data.path())
+            .expect("a directory")
+            .all(|file| { !file.expect("a file").file_name().to_string_lossy().starts_with("exported") })
+    );
+    let rest = learner(&["export", "--skip-damaged", "--out", out], data.path());
+    assert!(rest.status.success(), "{rest:?}");
+    let said = String::from_utf8_lossy(&rest.stderr);
+    assert!(said.contains(&victim.trajectory_id) && said.contains("left out 1 damaged"), "{said}");
+    let lines = fs::read_to_string(&file).expect("an export");
+    let exported = lines.lines().map(|line| serde_json::from_str::<Value>(line).expect("a trajectory")["id"].clone());
+    let ids = (0..200).filter(|&number| number != 31).map(|number| Value::from(trajectory(number).trajectory_id));
+    assert!(exported.eq(ids));
+    let calm = learner(&["export", "--skip-damaged", "--style", "calm"], data.path());
+    assert!(calm.status.success() && calm.stdout.split(|byte| *byte == b'\n').count() == 68, "{calm:?}");
     let busy = learner(&["repair"], data.path());
     assert_eq!(busy.status.code(), Some(1));
     assert!(complaint(&busy).1.contains("stop the other program"), "{busy:?}");

@@ -1,17 +1,24 @@
 //! `learner export` and `learner delete`: whole trajectories out of the store.
 
-use super::{StoreArgs, connect::connect, error::CliError, models};
+use super::{StoreArgs, connect::connect, data_directory, error::CliError, models};
 use clap::{Args, ValueEnum};
-use mazeway_client::{Code, Learner, packed::Packed};
-use mazeway_learner::files::{COLUMNS, Names, Naming, ParquetExport, Step};
+use mazeway_client::{ClientError, Code, Learner, packed::Packed};
+use mazeway_learner::{
+    files::{COLUMNS, Names, Naming, ParquetExport, Step},
+    store::{self, Kind, Recording},
+};
 use mazeway_proto::learner as pb;
 use serde_json::{Value, json};
 use std::{
     collections::BTreeMap,
-    fs::File,
+    fs::{self, File},
     io::{self, BufWriter, Write},
     path::PathBuf,
 };
+use tokio::task::spawn_blocking;
+
+/// Damaged trajectories that are named at most.
+const NAMED: usize = 50;
 
 /// Which trajectories.
 #[derive(Debug, Args)]
@@ -44,6 +51,17 @@ impl FilterArgs {
             ..Default::default()
         }
     }
+
+    /// What the filter means, where no query can be asked.
+    fn selects(&self, recording: &Recording) -> bool {
+        let collection = recording.collection();
+        let is = |wanted: &str, got: &str| wanted.is_empty() || wanted == got;
+        is(&self.env, &collection.env_id)
+            && is(&self.style, &collection.style)
+            && is(&self.source, &collection.source)
+            && is(&self.model, &collection.model_id)
+            && (self.ids.is_empty() || self.ids.iter().any(|id| id.parse() == Ok(recording.id())))
+    }
 }
 
 /// How trajectories are written.
@@ -74,30 +92,94 @@ pub struct ExportArgs {
     /// Write states and actions by the labels of the environment's model rather than by their indices
     #[arg(long)]
     labels: bool,
+    /// Leave out what is damaged, say what that is, and write all else; reads the directory itself
+    #[arg(long, conflicts_with_all = ["fit", "labels", "addr"])]
+    skip_damaged: bool,
     #[command(flatten)]
     store: StoreArgs,
 }
 
-/// Writes trajectories, in the order in which they were recorded.
+/// Writes trajectories, in the order in which they were recorded. A file has its name once all is in it.
 pub async fn export(args: ExportArgs) -> Result<(), CliError> {
-    let out: Box<dyn Write + Send> = match &args.out {
-        None => Box::new(BufWriter::new(io::stdout())),
-        Some(path) => Box::new(BufWriter::new(File::create(path).map_err(|error| {
-            CliError::failure(format!("cannot write {}: {error}", path.display()), "choose another file with --out")
-        })?)),
+    let Some(path) = args.out.clone() else {
+        return write(args, Box::new(BufWriter::new(io::stdout()))).await;
     };
+    let cannot = |error: io::Error| {
+        CliError::failure(format!("cannot write {}: {error}", path.display()), "choose another file with --out")
+    };
+    // A pipe or a device has no name to be given.
+    if path.metadata().is_ok_and(|there| !there.is_file()) {
+        return write(args, Box::new(BufWriter::new(File::create(&path).map_err(cannot)?))).await;
+    }
+    let mut part = path.clone().into_os_string();
+    part.push(".part");
+    let part = PathBuf::from(part);
+    let written = write(args, Box::new(BufWriter::new(File::create(&part).map_err(cannot)?))).await;
+    let named = written.and_then(|()| fs::rename(&part, &path).map_err(cannot));
+    if named.is_err() {
+        // Half an export is of no use, and the error of the export is the one to tell.
+        let _ = fs::remove_file(&part);
+    }
+    named
+}
+
+async fn write(args: ExportArgs, out: Box<dyn Write + Send>) -> Result<(), CliError> {
+    let sink = Sink::new(args.format, args.labels, out)?;
+    if args.skip_damaged {
+        return spawn_blocking(move || write_sound(args, sink)).await.expect("writing does not panic");
+    }
     let connected = connect(&args.store).await?;
-    let written = write(&args, &connected.learner, out).await;
+    let written = write_all(&args, &connected.learner, sink).await;
     connected.finish(written).await
 }
 
 /// Where trajectories go.
 enum Sink {
-    Text(Box<dyn Write + Send>),
+    Jsonl(Box<dyn Write + Send>),
+    Csv(Box<dyn Write + Send>),
     Parquet(Box<ParquetExport<Box<dyn Write + Send>>>),
 }
 
-async fn write(args: &ExportArgs, learner: &Learner, mut out: Box<dyn Write + Send>) -> Result<(), CliError> {
+impl Sink {
+    fn new(format: Format, labels: bool, mut out: Box<dyn Write + Send>) -> Result<Self, CliError> {
+        Ok(match format {
+            Format::Jsonl => Self::Jsonl(out),
+            Format::Csv => {
+                writeln!(out, "{}", COLUMNS.join(","))?;
+                Self::Csv(out)
+            }
+            Format::Parquet => Self::Parquet(Box::new(ParquetExport::new(out, labels).map_err(cannot_write)?)),
+        })
+    }
+
+    fn put(&mut self, trajectory: &pb::Trajectory, names: Option<&Called>) -> Result<(), CliError> {
+        let torn =
+            || CliError::failure(format!("trajectory {} is torn", trajectory.trajectory_id), "see 'learner list'");
+        match self {
+            Self::Parquet(parquet) => {
+                let steps = steps(trajectory).ok_or_else(torn)?;
+                parquet.write(trajectory, steps, names.map(|n| n as &dyn Naming)).map_err(cannot_write)
+            }
+            Self::Csv(out) => Ok(write_csv(trajectory, &steps(trajectory).ok_or_else(torn)?, names, out)?),
+            Self::Jsonl(out) => {
+                let mut value = plain(trajectory).ok_or_else(torn)?;
+                if let Some(names) = names {
+                    names.relabel(&mut value);
+                }
+                Ok(writeln!(out, "{value}")?)
+            }
+        }
+    }
+
+    fn finish(self) -> Result<(), CliError> {
+        match self {
+            Self::Parquet(parquet) => parquet.finish().map_err(cannot_write),
+            Self::Csv(mut out) | Self::Jsonl(mut out) => Ok(out.flush()?),
+        }
+    }
+}
+
+async fn write_all(args: &ExportArgs, learner: &Learner, mut sink: Sink) -> Result<(), CliError> {
     let mut labels = Labels { wanted: args.labels, models: BTreeMap::new() };
     let filter = args.filter.filter();
     let mut pages = match &args.fit {
@@ -110,42 +192,42 @@ async fn write(args: &ExportArgs, learner: &Learner, mut out: Box<dyn Write + Se
             _ => error.into(),
         })?,
     };
-    if args.format == Format::Csv {
-        writeln!(out, "{}", COLUMNS.join(","))?;
-    }
-    let mut sink = match args.format {
-        Format::Parquet => Sink::Parquet(Box::new(ParquetExport::new(out, args.labels).map_err(cannot_write)?)),
-        Format::Csv | Format::Jsonl => Sink::Text(out),
-    };
-    while let Some(page) = pages.next().await? {
+    while let Some(page) = pages.next().await.map_err(damaged)? {
         for trajectory in page {
-            let torn =
-                || CliError::failure(format!("trajectory {} is torn", trajectory.trajectory_id), "see 'learner list'");
             let names = labels.of(learner, &trajectory).await?;
-            match &mut sink {
-                Sink::Parquet(parquet) => {
-                    let steps = steps(&trajectory).ok_or_else(torn)?;
-                    parquet
-                        .write(&trajectory, steps, names.as_ref().map(|n| n as &dyn Naming))
-                        .map_err(cannot_write)?;
-                }
-                Sink::Text(out) if args.format == Format::Csv => {
-                    write_csv(&trajectory, &steps(&trajectory).ok_or_else(torn)?, names.as_ref(), out)?;
-                }
-                Sink::Text(out) => {
-                    let mut value = plain(&trajectory).ok_or_else(torn)?;
-                    if let Some(names) = &names {
-                        names.relabel(&mut value);
-                    }
-                    writeln!(out, "{value}")?;
-                }
-            }
+            sink.put(&trajectory, names.as_ref())?;
         }
     }
-    match sink {
-        Sink::Parquet(parquet) => parquet.finish().map_err(cannot_write),
-        Sink::Text(mut out) => Ok(out.flush()?),
+    sink.finish()
+}
+
+/// What else can be done where the store is damaged.
+fn damaged(error: ClientError) -> CliError {
+    let is_damage = error.code() == Code::DataLoss;
+    let mut error = CliError::from(error);
+    if is_damage {
+        "write all that is sound with --skip-damaged, or run 'learner repair'".clone_into(&mut error.hint);
     }
+    error
+}
+
+/// Writes what is sound of a damaged store and names what is not.
+fn write_sound(args: ExportArgs, mut sink: Sink) -> Result<(), CliError> {
+    let directory = data_directory(args.store.data)?;
+    let found = store::sound_trajectories(&directory, |recording| {
+        if args.filter.selects(recording) {
+            sink.put(&recording.clone().into(), None)?;
+        }
+        Ok::<_, CliError>(())
+    })?;
+    sink.finish()?;
+    for damage in found.damage.iter().filter(|damage| damage.kind == Kind::Trajectory).take(NAMED) {
+        eprintln!("left out {}: {}", damage.name, damage.message);
+    }
+    if found.trajectories.damaged > 0 {
+        eprintln!("left out {} damaged trajectories in all", found.trajectories.damaged);
+    }
+    Ok(())
 }
 
 fn cannot_write(error: impl std::fmt::Display) -> CliError {

@@ -2,12 +2,31 @@
 //!
 //! What a caller records is charged in the transaction that stores it: a repeated trajectory costs nothing, a refused one
 //! neither, and no crash lets one in that is not charged. Deleting gives nothing back, for who deletes need not be who
-//! recorded. The table is made at its first use and is no part of the schema: a store without it has charged nobody, which
-//! is also what a repaired one says.
+//! recorded. The table is made at its first use and is no part of the schema: a store without it has charged nobody. A repaired
+//! one has charged what the damaged one still told.
 
 use super::StoreError;
 use rusqlite::Connection;
 use std::path::Path;
+
+const TABLE: &str =
+    "CREATE TABLE IF NOT EXISTS recorded_bytes (caller TEXT PRIMARY KEY, bytes INTEGER NOT NULL) STRICT";
+
+/// Takes over what was charged, as far as it reads.
+///
+/// # Errors
+/// It cannot be written.
+pub(super) fn copy(old: &Connection, new: &Connection) -> rusqlite::Result<()> {
+    let Ok(mut statement) = old.prepare("SELECT caller, bytes FROM recorded_bytes") else { return Ok(()) };
+    let Ok(mut rows) = statement.query([]) else { return Ok(()) };
+    new.execute_batch(TABLE)?;
+    while let Ok(Some(row)) = rows.next() {
+        if let (Ok(caller), Ok(bytes)) = (row.get::<_, String>(0), row.get::<_, i64>(1)) {
+            new.execute("INSERT OR REPLACE INTO recorded_bytes VALUES (?, ?)", (caller, bytes))?;
+        }
+    }
+    Ok(())
+}
 
 /// Who records, and how much it may.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -22,11 +41,7 @@ impl Allowance {
     /// Counts bytes that are being stored. The caller's savepoint takes everything back where it fails.
     pub(super) fn charge(&self, connection: &Connection, path: &Path, bytes: u64) -> Result<(), StoreError> {
         let fail = |error: rusqlite::Error| StoreError::from_sqlite(path, &error);
-        connection
-            .execute_batch(
-                "CREATE TABLE IF NOT EXISTS recorded_bytes (caller TEXT PRIMARY KEY, bytes INTEGER NOT NULL) STRICT",
-            )
-            .map_err(fail)?;
+        connection.execute_batch(TABLE).map_err(fail)?;
         let used: i64 = connection
             .prepare_cached(
                 "INSERT INTO recorded_bytes (caller, bytes) VALUES (?, ?) \

@@ -3,7 +3,7 @@
 //! Invariants: the copy is of one moment; it has its name only once it is whole, on stable storage and checked; writers do
 //! not wait for it, and their log is kept until it is done.
 
-use super::{StoreError, Verification, check::walk, schema};
+use super::{StoreError, Verification, check::walk, room::Room, schema};
 use rusqlite::{
     Connection,
     backup::{Backup, StepResult},
@@ -20,6 +20,7 @@ const PAUSE: Duration = Duration::from_millis(20);
 /// # Errors
 /// There is no store, or there is one where the copy is to be; the disk is full.
 pub fn backup(directory: &Path, destination: &Path) -> Result<Verification, StoreError> {
+    let _room = Room::as_found(directory);
     let source = schema::open_existing(&directory.join(schema::FILE_NAME))?;
     let fail = |error: io::Error| StoreError::directory(destination, &error);
     schema::make_directory(destination).map_err(fail)?;
@@ -45,7 +46,7 @@ pub fn backup(directory: &Path, destination: &Path) -> Result<Verification, Stor
         copy.pragma_update(None, "journal_mode", "DELETE").map_err(sqlite)?;
     }
     fs::File::open(&part).and_then(|file| file.sync_all()).map_err(fail)?;
-    let found = walk(&schema::open_existing(&part)?, &path, |_| Ok(()))?;
+    let found = walk(&schema::open_existing(&part)?, &path, |_| Ok::<_, StoreError>(()))?;
     fs::rename(&part, &path).map_err(fail)?;
     schema::sync_directory(destination).map_err(fail)?;
     Ok(found)

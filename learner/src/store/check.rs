@@ -1,7 +1,8 @@
 //! Is what is stored what was stored? And what can still be read of a file that is damaged?
 //!
 //! Structure is SQLite's: its `integrity_check` looks at pages, order of keys and indices. Contents are ours: a trajectory
-//! is checked against the SHA-256 that it was stored with, a model against its id, which is its SHA-256, a fit by decoding.
+//! is checked against the SHA-256 that it was stored with, a model against its id, which is its SHA-256, a fit against the SHA-256
+//! in its document.
 //! Rows are read one by one, by every key that any index or the table itself still tells, so that a page that does not
 //! read costs the rows that lie on it and no others.
 
@@ -10,12 +11,13 @@ use super::{
     filter::stored_uuid,
     fits, models,
     packing::{torn, unpack},
+    room::Room,
     schema,
     trajectories::{self, blob},
 };
 use rusqlite::Connection;
 use std::{
-    collections::{HashMap, HashSet},
+    collections::{BTreeMap, HashMap, HashSet},
     path::{Path, PathBuf},
 };
 use uuid::Uuid;
@@ -24,8 +26,8 @@ use uuid::Uuid;
 const MAX_FINDINGS: u32 = 100;
 /// Damaged things that are named at most, of each kind; all are counted.
 const MAX_NAMED: usize = 10_000;
-/// Keys that are tried at most where some may not be known.
-const MAX_GUESSED: i64 = 50_000_000;
+/// Keys that are tried in vain at most where the table does not read: more than any damaged page hides.
+const MAX_TRIED: u32 = 1 << 20;
 /// Keys beyond the last known one that are tried.
 const BEYOND: i64 = 10_000;
 
@@ -120,14 +122,30 @@ pub enum Sound<'a> {
 /// # Errors
 /// There is no store; it is a newer release's or another program's.
 pub fn verify(directory: &Path) -> Result<Verification, StoreError> {
+    sound_trajectories(directory, |_| Ok::<_, StoreError>(()))
+}
+
+/// As [`verify`], and calls `visit` with every trajectory that is what was stored, in the order of recording: what can be read
+/// of a damaged store without repairing it.
+///
+/// # Errors
+/// As [`verify`], and those of `visit`.
+pub fn sound_trajectories<E: From<StoreError>>(
+    directory: &Path,
+    mut visit: impl FnMut(&Recording) -> Result<(), E>,
+) -> Result<Verification, E> {
     let path = directory.join(schema::FILE_NAME);
+    let _room = Room::as_found(directory);
     let connection = match schema::open_existing(&path) {
         Err(StoreError::Corrupt { message, .. }) => {
             return Ok(Verification { path, structure: vec![message], ..Verification::default() });
         }
         opened => opened?,
     };
-    walk(&connection, &path, |_| Ok(()))
+    walk(&connection, &path, |sound| match sound {
+        Sound::Trajectory { recording, .. } => visit(recording),
+        Sound::Model { .. } | Sound::Fit { .. } => Ok(()),
+    })
 }
 
 /// What SQLite finds wrong with the structure of the database.
@@ -141,11 +159,11 @@ pub(super) fn structure(connection: &Connection) -> rusqlite::Result<Vec<String>
 ///
 /// # Errors
 /// Those of `visit`.
-pub(super) fn walk(
+pub(super) fn walk<E: From<StoreError>>(
     connection: &Connection,
     path: &Path,
-    mut visit: impl FnMut(Sound<'_>) -> Result<(), StoreError>,
-) -> Result<Verification, StoreError> {
+    mut visit: impl FnMut(Sound<'_>) -> Result<(), E>,
+) -> Result<Verification, E> {
     let corrupt = |error: &rusqlite::Error| StoreError::from_sqlite(path, error);
     let snapshot = connection.unchecked_transaction().map_err(|e| corrupt(&e))?;
     let mut found = Verification { path: path.to_owned(), ..Verification::default() };
@@ -159,9 +177,12 @@ pub(super) fn walk(
     }
     let whole = found.structure.is_empty();
 
-    let names = if whole { HashMap::new() } else { names(&snapshot) };
+    let names = if whole { BTreeMap::new() } else { names(&snapshot) };
     // An id is no part of what is hashed: where the row and the index do not agree on whose it is, nobody knows.
-    let owners: HashMap<Uuid, i64> = names.iter().map(|(&key, &id)| (id, key)).collect();
+    let mut owners = HashMap::new();
+    for (&key, &id) in &names {
+        owners.entry(id).or_insert(key);
+    }
     let mut seen = HashSet::new();
     let mut another = |key: i64, id: Uuid| {
         let elsewhere = owners.get(&id).is_some_and(|owner| *owner != key);
@@ -169,7 +190,7 @@ pub(super) fn walk(
     };
     let mut collections = HashMap::new();
     let keys = Keys::new(&snapshot, "trajectories", "seq", &["trajectories_by_collection"], whole);
-    keys.try_for_each(|key, known| {
+    keys.try_for_each(|key| {
         let name = || names.get(&key).map_or_else(|| format!("row {key}"), Uuid::to_string);
         match trajectory(&snapshot, path, found.schema, &mut collections, key) {
             Ok(Some((_, recording))) if another(key, recording.id()) => {
@@ -185,41 +206,38 @@ pub(super) fn walk(
                 visit(Sound::Trajectory { seq: key, recorded_at_us, recording: &recording })?;
                 found.count(Kind::Trajectory, Ok(()));
             }
-            Ok(None) if known => {
+            Ok(None) => {
                 found.count(Kind::Trajectory, Err((name(), damaged("trajectory", "its row is missing"))));
             }
-            Err((id, error)) if known => found.count(Kind::Trajectory, Err((id.unwrap_or_else(name), error))),
-            Ok(None) | Err(_) => {}
+            Err((id, error)) => found.count(Kind::Trajectory, Err((id.unwrap_or_else(name), error))),
         }
-        Ok(())
+        Ok::<_, E>(())
     })?;
-    Keys::new(&snapshot, "models", "rowid", &[], whole).try_for_each(|key, known| {
+    Keys::new(&snapshot, "models", "rowid", &[], whole).try_for_each(|key| {
         match models::by_row(&snapshot, path, key) {
             Ok(Some((stored_at_us, model))) => {
                 visit(Sound::Model { stored_at_us, model: &model })?;
                 found.count(Kind::Model, Ok(()));
             }
-            Ok(None) if known => {
+            Ok(None) => {
                 found.count(Kind::Model, Err((format!("row {key}"), damaged("model", "its row is missing"))));
             }
-            Err(error) if known => found.count(Kind::Model, Err((format!("row {key}"), error))),
-            Ok(None) | Err(_) => {}
+            Err(error) => found.count(Kind::Model, Err((format!("row {key}"), error))),
         }
-        Ok(())
+        Ok::<_, E>(())
     })?;
-    Keys::new(&snapshot, "fits", "seq", &["fits_by_env"], whole).try_for_each(|key, known| {
+    Keys::new(&snapshot, "fits", "seq", &["fits_by_env"], whole).try_for_each(|key| {
         match fits::by_row(&snapshot, path, key) {
             Ok(Some(_)) => {
                 visit(Sound::Fit { row: key })?;
                 found.count(Kind::Fit, Ok(()));
             }
-            Ok(None) if known => {
+            Ok(None) => {
                 found.count(Kind::Fit, Err((format!("row {key}"), damaged("fit", "its row is missing"))));
             }
-            Err(error) if known => found.count(Kind::Fit, Err((format!("row {key}"), error))),
-            Ok(None) | Err(_) => {}
+            Err(error) => found.count(Kind::Fit, Err((format!("row {key}"), error))),
         }
-        Ok(())
+        Ok::<_, E>(())
     })?;
     Ok(found)
 }
@@ -229,16 +247,19 @@ fn damaged(what: &str, message: impl Into<String>) -> StoreError {
 }
 
 /// The keys of a table.
-struct Keys {
+struct Keys<'a> {
+    connection: &'a Connection,
+    table: &'a str,
+    key: &'a str,
     /// What the table or an index tells, rising.
     known: Vec<i64>,
     /// Where there may be more: within this range.
     guessed: Option<(i64, i64)>,
 }
 
-impl Keys {
+impl<'a> Keys<'a> {
     /// Where the structure is whole, the table tells; else whatever reads of the table and its indices, from either end.
-    fn new(connection: &Connection, table: &str, key: &str, indices: &[&str], whole: bool) -> Self {
+    fn new(connection: &'a Connection, table: &'a str, key: &'a str, indices: &[&str], whole: bool) -> Self {
         let mut known = Vec::new();
         let mut read = |sql: &str| {
             let Ok(mut statement) = connection.prepare(sql) else { return };
@@ -249,7 +270,7 @@ impl Keys {
         };
         read(&format!("SELECT {key} FROM {table} NOT INDEXED ORDER BY {key}"));
         if whole {
-            return Self { known, guessed: None };
+            return Self { connection, table, key, known, guessed: None };
         }
         read(&format!("SELECT {key} FROM {table} NOT INDEXED ORDER BY {key} DESC"));
         let own = format!("sqlite_autoindex_{table}_1");
@@ -259,24 +280,46 @@ impl Keys {
         known.sort_unstable();
         known.dedup();
         // Pages before and after what is known may be such as no index tells of.
-        let range = known.first().zip(known.last()).map(|(&first, &last)| (first.min(1), last.saturating_add(BEYOND)));
-        Self { known, guessed: range.filter(|(first, last)| last.saturating_sub(*first) <= MAX_GUESSED) }
+        let guessed =
+            known.first().zip(known.last()).map(|(&first, &last)| (first.min(1), last.saturating_add(BEYOND)));
+        Self { connection, table, key, known, guessed }
     }
 
-    /// Every key, rising, and whether it is known.
-    fn try_for_each(self, mut visit: impl FnMut(i64, bool) -> Result<(), StoreError>) -> Result<(), StoreError> {
-        match self.guessed {
-            None => self.known.into_iter().try_for_each(|key| visit(key, true)),
-            Some((first, last)) => {
-                (first..=last).try_for_each(|key| visit(key, self.known.binary_search(&key).is_ok()))
+    /// Every key, rising. The table is asked for the next key that it has, so that gaps cost nothing; where it does not read
+    /// on, the next key is tried, for what follows may lie on a page that reads.
+    fn try_for_each<E>(self, mut visit: impl FnMut(i64) -> Result<(), E>) -> Result<(), E> {
+        let Self { connection, table, key, known, guessed } = self;
+        let sql = format!("SELECT {key} FROM {table} NOT INDEXED WHERE {key} >= ? ORDER BY {key} LIMIT 1");
+        let (Some((mut at, last)), Ok(mut statement)) = (guessed, connection.prepare(&sql)) else {
+            return known.into_iter().try_for_each(visit);
+        };
+        let mut known = known.into_iter().peekable();
+        let mut left = MAX_TRIED;
+        while at <= last && left > 0 {
+            let next = match statement.query_row([at], |row| row.get::<_, i64>(0)) {
+                Ok(next) if next >= at => Some(next),
+                Err(rusqlite::Error::QueryReturnedNoRows) => break,
+                _ => None,
+            };
+            left -= u32::from(next.is_none());
+            let reached = next.unwrap_or(at);
+            while let Some(missing) = known.next_if(|known| *known < reached) {
+                visit(missing)?;
             }
+            let is_known = known.next_if_eq(&reached).is_some();
+            if is_known || next.is_some() {
+                visit(reached)?;
+            }
+            let Some(after) = reached.checked_add(1) else { break };
+            at = after;
         }
+        known.try_for_each(visit)
     }
 }
 
 /// Ids of trajectories by row, as far as the index of the ids reads.
-fn names(connection: &Connection) -> HashMap<i64, Uuid> {
-    let mut names = HashMap::new();
+fn names(connection: &Connection) -> BTreeMap<i64, Uuid> {
+    let mut names = BTreeMap::new();
     let sql = "SELECT seq, trajectory_id FROM trajectories INDEXED BY sqlite_autoindex_trajectories_1";
     let Ok(mut statement) = connection.prepare(sql) else { return names };
     let Ok(mut rows) = statement.query([]) else { return names };

@@ -1,6 +1,6 @@
 //! What can go wrong with the store, with the values that a caller needs to say what to do about it.
 
-use rusqlite::ErrorCode;
+use rusqlite::{ErrorCode, ffi};
 use std::{io, path::PathBuf};
 use uuid::Uuid;
 
@@ -114,7 +114,10 @@ impl StoreError {
     /// Sorts an error of SQLite's.
     pub(super) fn from_sqlite(path: &std::path::Path, error: &rusqlite::Error) -> Self {
         let path = path.to_owned();
+        // Of the file that readers share: it does not grow where there is no room.
+        let shared = error.sqlite_error().is_some_and(|error| error.extended_code == ffi::SQLITE_IOERR_SHMSIZE);
         match error.sqlite_error_code() {
+            _ if shared => Self::DiskFull { path },
             Some(ErrorCode::DiskFull) => Self::DiskFull { path },
             Some(ErrorCode::DatabaseBusy | ErrorCode::DatabaseLocked) => Self::Busy { path },
             Some(ErrorCode::DatabaseCorrupt | ErrorCode::NotADatabase) => {

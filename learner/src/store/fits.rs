@@ -2,18 +2,21 @@
 //! trajectories that a fit used lie on pages of their own: they are as many as the data, and few ask for them.
 
 use super::{
-    StoreError,
+    StoreError, document,
     id_list::{IDS_A_PAGE, IdList, Tally, write_page},
 };
+use bytes::Bytes;
 use mazeway_proto::learner as pb;
 use prost::Message as _;
 use rusqlite::{Connection, OptionalExtension, Row, params};
 use std::path::Path;
 use uuid::Uuid;
 
-/// Version of the document: a `mazeway.learner.v1.Fit` behind this byte.
-const DOCUMENT_VERSION: u8 = 2;
-/// The version whose documents held the ids of the trajectories too.
+/// Version of the document: a `mazeway.learner.v1.Fit` behind this byte and the SHA-256 of the message.
+const DOCUMENT_VERSION: u8 = 3;
+/// The version whose documents had no hash.
+const WITHOUT_HASH: u8 = 2;
+/// The version whose documents had no hash and held the ids of the trajectories too.
 const WITH_IDS: u8 = 1;
 
 /// What is known of a fit without its arrays.
@@ -77,17 +80,15 @@ pub(super) fn insert(
                 fit.stopped,
                 fit.iterations,
                 fit.agreement,
-                document(fit),
+                encode(fit),
             ])
         })
         .map_err(fail)?;
     ids.write(connection, path, row)
 }
 
-fn document(fit: &pb::Fit) -> Vec<u8> {
-    let mut document = vec![DOCUMENT_VERSION];
-    document.extend(fit.encode_to_vec());
-    document
+fn encode(fit: &pb::Fit) -> Vec<u8> {
+    document::seal(DOCUMENT_VERSION, &fit.encode_to_vec())
 }
 
 /// The row and the whole id of the one fit whose id begins so.
@@ -115,14 +116,17 @@ pub(super) fn get(connection: &Connection, path: &Path, prefix: &str) -> Result<
 }
 
 /// The document of a row.
-fn stored(connection: &Connection, row: i64) -> rusqlite::Result<Vec<u8>> {
-    connection.query_row("SELECT document FROM fits WHERE seq = ?", [row], |row| row.get(0))
+fn stored(connection: &Connection, row: i64) -> rusqlite::Result<Bytes> {
+    connection
+        .query_row("SELECT document FROM fits WHERE seq = ?", [row], |row| row.get::<_, Vec<u8>>(0))
+        .map(Bytes::from)
 }
 
 /// A document of any version.
-fn decode(document: &[u8]) -> Result<pb::Fit, String> {
+fn decode(document: &Bytes) -> Result<pb::Fit, String> {
     match document.split_first() {
-        Some((&DOCUMENT_VERSION, message)) => pb::Fit::decode(message).map_err(|e| e.to_string()),
+        Some((&DOCUMENT_VERSION, _)) => pb::Fit::decode(document::unseal(document)?).map_err(|e| e.to_string()),
+        Some((&WITHOUT_HASH, message)) => pb::Fit::decode(message).map_err(|e| e.to_string()),
         Some((&WITH_IDS, message)) => {
             let mut fit = pb::Fit::decode(message).map_err(|e| e.to_string())?;
             let mut tally = Tally::default();
@@ -161,7 +165,7 @@ pub(super) fn unfold(connection: &Connection, row: i64) -> rusqlite::Result<()> 
         let ids = ids.iter().flat_map(|id| *id.as_bytes()).collect::<Vec<u8>>();
         write_page(connection, row, page as i64, &ids)?;
     }
-    connection.execute("UPDATE fits SET document = ? WHERE seq = ?", params![document(&fit), row])?;
+    connection.execute("UPDATE fits SET document = ? WHERE seq = ?", params![encode(&fit), row])?;
     Ok(())
 }
 
@@ -175,7 +179,7 @@ pub(super) fn by_row(connection: &Connection, path: &Path, seq: i64) -> Result<O
     if fit.fit_id != fit_id {
         return Err(corrupt(&fit_id, "its document is that of another fit"));
     }
-    if document.first() == Some(&DOCUMENT_VERSION) {
+    if document.first() != Some(&WITH_IDS) {
         let mut tally = Tally::default();
         let sql = "SELECT page, ids FROM fit_trajectories WHERE fit = ? ORDER BY page";
         let mut statement = connection.prepare_cached(sql).map_err(fail)?;

@@ -12,6 +12,7 @@ mod activity;
 mod allowance;
 mod backup;
 mod check;
+mod document;
 mod error;
 mod filter;
 mod fits;
@@ -21,6 +22,7 @@ mod options;
 mod packing;
 mod recording;
 mod repair;
+mod room;
 mod scan;
 mod schema;
 mod trajectories;
@@ -32,7 +34,7 @@ mod tests;
 pub use activity::Activity;
 pub use allowance::Allowance;
 pub use backup::backup;
-pub use check::{Damage, Kind, Tally, Verification, verify};
+pub use check::{Damage, Kind, Tally, Verification, sound_trajectories, verify};
 pub use error::StoreError;
 pub use filter::Filter;
 pub use fits::FitInfo;
@@ -51,6 +53,7 @@ pub use writer::Pending;
 
 use activity::Recorded;
 use mazeway_proto::learner as pb;
+use room::Room;
 use rusqlite::Connection;
 use std::{
     fs::File,
@@ -88,6 +91,7 @@ struct Inner {
     writer: Writer,
     activity: Arc<Activity>,
     pending: Arc<Semaphore>,
+    _room: Room,
     _user: File,
 }
 
@@ -103,7 +107,9 @@ impl Store {
         let activity = Arc::new(Activity::default());
         let writer = Writer::start(connection, path.clone(), Arc::clone(&activity))?;
         let pending = Arc::new(Semaphore::new(PENDING_BYTES / PENDING_UNIT));
-        Ok(Self(Arc::new(Inner { path, options, readers: Mutex::default(), writer, activity, pending, _user: user })))
+        let readers = Mutex::default();
+        let (_room, _user) = (Room::kept(directory), user);
+        Ok(Self(Arc::new(Inner { path, options, readers, writer, activity, pending, _room, _user })))
     }
 
     /// As [`Store::open`], where there is a store already. Blocks.

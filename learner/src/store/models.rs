@@ -5,7 +5,7 @@
 //! SHA-256 that `mazeway/env/v1/model.proto` lays down.
 
 use super::{
-    StoreError, now_us,
+    StoreError, document, now_us,
     recording::{FieldError, check_label, clip, unpack_f64, unpack_u32},
 };
 use bytes::Bytes;
@@ -15,8 +15,10 @@ use rusqlite::{Connection, OptionalExtension, params};
 use sha2::{Digest, Sha256};
 use std::{fmt::Write as _, path::Path};
 
-/// Version of the header's encoding: a protocol buffer message behind this byte.
-const DOCUMENT_VERSION: u8 = 1;
+/// Version of the header's encoding: behind it and a hash, the hash of the visit counts and a protocol buffer message.
+const DOCUMENT_VERSION: u8 = 2;
+/// The version that had no hashes.
+const WITHOUT_HASH: u8 = 1;
 /// How far a sum of probabilities may lie from 1, as for [`crate::mdp::TabularMdp`].
 const ROW_SUM_TOLERANCE: f64 = 1e-9;
 
@@ -292,14 +294,15 @@ pub enum Put {
 pub(super) fn insert(connection: &Connection, path: &Path, model: &Model, replace: bool) -> Result<Put, StoreError> {
     let fail = |e: rusqlite::Error| StoreError::from_sqlite(path, &e);
     let Model { header, rows } = model;
-    let mut document = vec![DOCUMENT_VERSION];
-    document.extend(header.encode_to_vec());
+    // The id, a hash, stands for the other rows.
+    let message = [&document::hash(&rows.visit_counts)[..], &header.encode_to_vec()].concat();
+    let document = document::seal(DOCUMENT_VERSION, &message);
     let known = connection
         .query_row("SELECT header FROM models WHERE model_id = ?", [&header.model_id], |row| row.get::<_, Vec<u8>>(0))
         .optional()
         .map_err(fail)?;
     if let Some(known) = known {
-        let known = decode_header(known.into(), &header.model_id)?;
+        let (known, _) = decode_header(known.into(), &header.model_id)?;
         if known == *header {
             return Ok(Put::Known);
         }
@@ -374,7 +377,13 @@ pub(super) fn get(connection: &Connection, path: &Path, model_id: &str) -> Resul
         )
         .optional()
         .map_err(fail)?;
-    found.map(|(document, rows)| Ok(Model { header: decode_header(document, model_id)?, rows })).transpose()
+    let Some((document, rows)) = found else { return Ok(None) };
+    let (header, counts) = decode_header(document, model_id)?;
+    if counts.is_some_and(|counts| counts != document::hash(&rows.visit_counts)) {
+        let message = "its visit counts are not what was stored: the hashes differ".into();
+        return Err(StoreError::Corrupt { what: format!("model {model_id}"), message });
+    }
+    Ok(Some(Model { header, rows }))
 }
 
 /// Reads the model of a row, checks it as if it came from outside, and tells when it was stored.
@@ -409,7 +418,7 @@ pub(super) fn list(connection: &Connection, path: &Path, env_id: &str) -> Result
         let model_id: String = row.get(0).map_err(fail)?;
         let document: Vec<u8> = row.get(1).map_err(fail)?;
         models.push(ModelInfo {
-            header: decode_header(document.into(), &model_id)?,
+            header: decode_header(document.into(), &model_id)?.0,
             n_transitions: row.get::<_, i64>(2).map_err(fail)? as u64,
             stored_at_us: row.get(3).map_err(fail)?,
         });
@@ -417,10 +426,16 @@ pub(super) fn list(connection: &Connection, path: &Path, env_id: &str) -> Result
     Ok(models)
 }
 
-fn decode_header(mut document: Bytes, model_id: &str) -> Result<ModelHeader, StoreError> {
+/// The header of a document, and the hash that the visit counts had, where it tells.
+fn decode_header(document: Bytes, model_id: &str) -> Result<(ModelHeader, Option<[u8; 32]>), StoreError> {
     let corrupt = |message: String| StoreError::Corrupt { what: format!("header of model {model_id}"), message };
-    if document.first() != Some(&DOCUMENT_VERSION) {
-        return Err(corrupt(format!("expected version {DOCUMENT_VERSION}, got {:?}", document.first())));
-    }
-    ModelHeader::decode(document.split_off(1)).map_err(|e| corrupt(e.to_string()))
+    let (counts, message) = match document.first() {
+        Some(&DOCUMENT_VERSION) => {
+            let split = document::unseal(&document).and_then(|message| document::split_hash(&message));
+            split.map(|(counts, message)| (Some(counts), message)).map_err(|message| corrupt(message.into()))?
+        }
+        Some(&WITHOUT_HASH) => (None, document.slice(1..)),
+        version => return Err(corrupt(format!("expected version {DOCUMENT_VERSION}, got {version:?}"))),
+    };
+    Ok((ModelHeader::decode(message).map_err(|e| corrupt(e.to_string()))?, counts))
 }

@@ -5,6 +5,7 @@
 
 use crate::trajectory::Trajectory;
 use bytes::Bytes;
+use mazeway_proto::learner as pb;
 use sha2::{Digest, Sha256};
 use uuid::Uuid;
 
@@ -266,6 +267,29 @@ pub fn pack_u32(values: &[u32]) -> Bytes {
 /// Packs doubles.
 pub fn pack_f64(values: &[f64]) -> Bytes {
     values.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>().into()
+}
+
+impl From<Recording> for pb::Trajectory {
+    /// As it goes over the wire.
+    fn from(recording: Recording) -> Self {
+        let (id, collection, seed, arrays) = recording.into_parts();
+        Self {
+            trajectory_id: id.to_string(),
+            env_id: collection.env_id,
+            model_id: collection.model_id,
+            style: collection.style,
+            source: collection.source,
+            seed,
+            n_states: collection.n_states,
+            n_actions: collection.n_actions,
+            states: arrays.states,
+            actions: arrays.actions,
+            rewards: arrays.rewards,
+            final_state: arrays.final_state,
+            terminated: arrays.terminated,
+            truncated: arrays.truncated,
+        }
+    }
 }
 
 #[cfg(test)]

@@ -5,7 +5,7 @@
 //! takes the place of the old one.
 
 use super::{
-    StoreError, StoreOptions, Verification,
+    StoreError, StoreOptions, Verification, allowance,
     check::{Sound, walk},
     fits, models, schema, trajectories,
 };
@@ -40,7 +40,7 @@ pub fn repair(directory: &Path) -> Result<Repair, StoreError> {
     let _alone = schema::lock_alone(directory)?;
     let fail = |error: io::Error| StoreError::directory(directory, &error);
     let old = schema::open_existing(&path)?;
-    let found = walk(&old, &path, |_| Ok(()))?;
+    let found = walk(&old, &path, |_| Ok::<_, StoreError>(()))?;
     if found.is_sound() {
         return Ok(Repair { found, kept: None });
     }
@@ -53,7 +53,7 @@ pub fn repair(directory: &Path) -> Result<Repair, StoreError> {
         new.pragma_update(None, "journal_mode", "DELETE").map_err(|e| StoreError::from_sqlite(&new_path, &e))?;
         found
     };
-    let new = walk(&schema::open_existing(&new_path)?, &new_path, |_| Ok(()))?;
+    let new = walk(&schema::open_existing(&new_path)?, &new_path, |_| Ok::<_, StoreError>(()))?;
     let expected = [found.trajectories.sound, found.models.sound, found.fits.sound];
     if !new.is_sound() || [new.trajectories.sound, new.models.sound, new.fits.sound] != expected {
         let message = format!("expected {expected:?} sound things in the new store, got {new:?}");
@@ -93,6 +93,7 @@ fn take_over(old: &Connection, path: &Path, new: &Connection, new_path: &Path) -
             fits::unfold(&transaction, row).map_err(fail)
         }
     })?;
+    allowance::copy(old, &transaction).map_err(fail)?;
     transaction.commit().map_err(fail)?;
     Ok(found)
 }

@@ -3,7 +3,7 @@
 //! Invariants: a migration, once released, never changes; a schema newer than this release is refused, not guessed at;
 //! opening and migrating happen under a lock on a file beside the database, so several processes may start at once.
 
-use super::{StoreError, StoreOptions, fits};
+use super::{StoreError, StoreOptions, fits, room::with_room};
 use rusqlite::{Connection, OpenFlags, config::DbConfig};
 use rusqlite_migration::{M, Migrations};
 use std::{
@@ -165,7 +165,7 @@ pub fn open(directory: &Path, options: &StoreOptions) -> Result<Opened, StoreErr
         Err(TryLockError::Error(error)) => return Err(StoreError::directory(directory, &error)),
     }
     let path = directory.join(FILE_NAME);
-    let connection = open_database(&path, options)?;
+    let connection = with_room(directory, || open_database(&path, options))?;
     Ok(Opened { path, connection, user })
 }
 
@@ -253,13 +253,15 @@ pub fn open_existing(path: &Path) -> Result<Connection, StoreError> {
         let error = io::Error::new(io::ErrorKind::NotFound, format!("it holds no {FILE_NAME}"));
         return Err(StoreError::directory(directory, &error));
     }
-    let connection = open_reader(path, &StoreOptions::default())?;
-    // What is looked at is left alone: its log is not written back into it.
-    connection
-        .set_db_config(DbConfig::SQLITE_DBCONFIG_NO_CKPT_ON_CLOSE, true)
-        .map_err(|e| StoreError::from_sqlite(path, &e))?;
-    check_owner(path, &connection)?;
-    Ok(connection)
+    with_room(path.parent().unwrap_or(path), || {
+        let connection = open_reader(path, &StoreOptions::default())?;
+        // What is looked at is left alone: its log is not written back into it.
+        connection
+            .set_db_config(DbConfig::SQLITE_DBCONFIG_NO_CKPT_ON_CLOSE, true)
+            .map_err(|e| StoreError::from_sqlite(path, &e))?;
+        check_owner(path, &connection)?;
+        Ok(connection)
+    })
 }
 
 /// A connection that only reads; it sees the last commit at the start of each of its statements or transactions.

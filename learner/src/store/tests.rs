@@ -394,3 +394,31 @@ fn a_count_sees_every_trajectory_once_and_in_order_whatever_is_asked() {
         assert_eq!(first, seen.first().map_or(ControlFlow::Continue(()), |first| ControlFlow::Break(first.id())));
     }
 }
+
+#[test]
+fn a_repair_keeps_what_each_caller_has_recorded() {
+    let directory = tempfile::tempdir().unwrap();
+    let one = simple(1, &[1, 2, 3]);
+    let bytes = one.packed_bytes() as u64;
+    let record = |store: &Store, recording: Recording| {
+        let allowance = Allowance { caller: "anna".into(), max_bytes: Some(2 * bytes) };
+        runtime()
+            .block_on(async { store.queue_recordings_of(Some(allowance), vec![recording]).await?.committed().await })
+    };
+    let store = Store::open(directory.path()).unwrap();
+    record(&store, one.clone()).unwrap();
+    record(&store, simple(2, &[4, 5, 6])).unwrap();
+    let path = store.path().to_owned();
+    drop(store);
+    // One of the two is damaged: the caller has recorded it all the same.
+    let mut file = std::fs::read(&path).unwrap();
+    let hash = one.content_hash();
+    let at = file.windows(32).rposition(|window| *window == hash).unwrap();
+    file[at] ^= 1;
+    std::fs::write(&path, file).unwrap();
+    let repaired = repair(directory.path()).unwrap();
+    assert_eq!(repaired.found.trajectories, Tally { sound: 1, damaged: 1 });
+    let store = Store::open(directory.path()).unwrap();
+    let refused = record(&store, simple(3, &[7, 8, 9]));
+    assert!(matches!(refused, Err(StoreError::AllowanceSpent { .. })), "{refused:?}");
+}

@@ -8,16 +8,18 @@ use super::{
     table::Table,
     value::Value,
 };
+use bytes::Bytes;
 use parquet::{
     basic::{ConvertedType, Type as PhysicalType},
     column::reader::{ColumnReader, ColumnReaderImpl},
     data_type::DataType,
     errors::ParquetError,
-    file::reader::{FileReader, SerializedFileReader},
+    file::reader::{ChunkReader, FileReader, Length, SerializedFileReader},
 };
 use std::{
     collections::VecDeque,
     fs::File,
+    io::{self, BufReader, Read},
     panic::{AssertUnwindSafe, catch_unwind},
     path::{Path, PathBuf},
 };
@@ -26,10 +28,44 @@ use std::{
 const BATCH: usize = 4096;
 const HINT: &str = "write it again with pandas, polars or DuckDB, compressed with snappy, zstd or not at all";
 
+/// A file that says where it ends: reading on there is an error. The library leaves out what it does not know by reading it,
+/// takes an end for bytes that were read, and would go on for billions of them where a damaged header says so.
+struct Bounded(File);
+
+impl Length for Bounded {
+    fn len(&self) -> u64 {
+        Length::len(&self.0)
+    }
+}
+
+impl ChunkReader for Bounded {
+    type T = Ending<BufReader<File>>;
+
+    fn get_read(&self, start: u64) -> Result<Self::T, ParquetError> {
+        self.0.get_read(start).map(Ending)
+    }
+
+    fn get_bytes(&self, start: u64, length: usize) -> Result<Bytes, ParquetError> {
+        self.0.get_bytes(start, length)
+    }
+}
+
+/// What of a file fails at its end.
+struct Ending<R>(R);
+
+impl<R: Read> Read for Ending<R> {
+    fn read(&mut self, buf: &mut [u8]) -> io::Result<usize> {
+        match self.0.read(buf)? {
+            0 if !buf.is_empty() => Err(io::ErrorKind::UnexpectedEof.into()),
+            read => Ok(read),
+        }
+    }
+}
+
 /// Columns of a Parquet file.
 pub struct ParquetTable {
     file: PathBuf,
-    reader: SerializedFileReader<File>,
+    reader: SerializedFileReader<Bounded>,
     columns: Vec<String>,
     /// Rank of each column among the leaves of the file.
     leaves: Vec<usize>,
@@ -73,7 +109,7 @@ impl ParquetTable {
     /// It cannot be read, or is none.
     pub fn open(file: &Path) -> Result<Self, FileError> {
         let opened = File::open(file).map_err(|error| FileError::unreadable(file, &error))?;
-        let reader = guarded(file, &Place::File, || SerializedFileReader::new(opened))?;
+        let reader = guarded(file, &Place::File, || SerializedFileReader::new(Bounded(opened)))?;
         let schema = reader.metadata().file_metadata().schema_descr_ptr();
         let (mut columns, mut leaves, mut unsigned) = (Vec::new(), Vec::new(), Vec::new());
         for leaf in 0..schema.num_columns() {

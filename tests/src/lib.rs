@@ -13,7 +13,22 @@ pub mod worlds;
 
 use mazeway_server::{Config, ListenAddress, Listener};
 use std::{net::SocketAddr, path::Path, thread::JoinHandle, time::Duration};
+use tempfile::TempDir;
 use tokio::sync::oneshot;
+
+/// A directory in memory where the machine has one, unless the environment names a place for temporary files.
+///
+/// # Panics
+/// None can be made.
+pub fn memory() -> TempDir {
+    let memory = Path::new("/dev/shm");
+    let made = if std::env::var_os("TMPDIR").is_none() && memory.is_dir() {
+        tempfile::tempdir_in(memory)
+    } else {
+        tempfile::tempdir()
+    };
+    made.expect("a directory")
+}
 
 /// Default limits, but calls that still run at the end of a test are cut off soon: its clients no longer answer by then.
 pub fn config() -> Config {

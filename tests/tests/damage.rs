@@ -2,6 +2,7 @@
 
 use mazeway_client::packed::pack;
 use mazeway_learner::store::{self, Arrays, Collection, FILE_NAME, Filter, Kind, Recording, Store, StoreError};
+use mazeway_tests::memory;
 use rand_core::Rng as _;
 use rand_pcg::Pcg64Mcg;
 use std::{fs, path::Path};
@@ -42,12 +43,6 @@ fn all(directory: &Path) -> Result<Vec<Recording>, StoreError> {
         all.extend(store.next_page(&mut cursor)?);
     }
     Ok(all)
-}
-
-fn memory() -> tempfile::TempDir {
-    let memory = Path::new("/dev/shm");
-    let made = if memory.is_dir() { tempfile::tempdir_in(memory) } else { tempfile::tempdir() };
-    made.expect("a directory")
 }
 
 /// A store of trajectories, and its bytes.
@@ -107,7 +102,7 @@ fn whatever_page_is_damaged_the_rest_is_taken_over_and_nothing_wrong_passes() {
                     );
                     // Every one that is not there is named, where anything that knows of it could be read.
                     let lost = recordings.len() - rest.len();
-                    assert!(found.trajectories.sound as usize == rest.len());
+                    assert_eq!(found.trajectories.sound as usize, rest.len(), "trial {trial}: {found:?}");
                     kept += rest.len();
                     repaired += 1;
                     if what == 0 {

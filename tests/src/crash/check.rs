@@ -1,12 +1,13 @@
 //! Does a history to a store, cuts the power at random moments, and compares what is left with what was promised.
 
 use super::{
-    disk::{Disk, Image, below},
-    history::{Contents, Step, extra, steps},
+    disk::{Disk, Fault, Image, below},
+    history::{Contents, Step, extra, fault, steps},
     subject::{Segment, Subject},
     vfs::{self, mount, unmount},
 };
-use mazeway_learner::store::{FILE_NAME, Filter, Recording, Store, StoreError, StoreOptions};
+use crate::memory;
+use mazeway_learner::store::{self, FILE_NAME, Filter, Recording, Store, StoreError, StoreOptions};
 use mazeway_proto::learner as pb;
 use proptest::{
     prelude::*,
@@ -24,6 +25,10 @@ use tokio::runtime::Runtime;
 const CUTS: usize = 24;
 /// Pages after which a log is written back: few, so that it happens often.
 const CHECKPOINT_PAGES: u32 = 12;
+/// After one cut in so many a page is damaged as well.
+const DAMAGE_ONE_IN: usize = 16;
+/// Bytes that are damaged.
+const SECTOR: usize = 512;
 
 /// What was tried and found.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -40,6 +45,8 @@ pub struct Tally {
     pub cuts_within: u64,
     /// Of these, how many left the request there as a whole.
     pub kept_within: u64,
+    /// Stores that were damaged after a cut, and checked and repaired.
+    pub damaged: u64,
 }
 
 impl std::ops::AddAssign for Tally {
@@ -50,6 +57,7 @@ impl std::ops::AddAssign for Tally {
         self.acknowledged += other.acknowledged;
         self.cuts_within += other.cuts_within;
         self.kept_within += other.kept_within;
+        self.damaged += other.damaged;
     }
 }
 
@@ -68,13 +76,14 @@ pub fn run(seed: u64, cuts: u64, old: &[u8], lies: bool) -> Result<Tally, String
     let mut runner = TestRunner::new_with_rng(config, TestRng::from_seed(RngAlgorithm::ChaCha, &bytes));
     let bench = Bench::new(lies);
     let tally = std::cell::Cell::new(Tally::default());
-    let histories = (any::<u64>(), any::<u8>(), prop::collection::vec(steps(), 1..4));
-    let outcome = runner.run(&histories, |(luck, start, generations)| {
+    // Half of them open on a disk that fails: a store of the first release is migrated on it.
+    let histories = (any::<u64>(), any::<u8>(), prop::option::of(fault()), prop::collection::vec(steps(), 1..4));
+    let outcome = runner.run(&histories, |(luck, start, fault, generations)| {
         let mut sum = tally.get();
         if sum.cuts < cuts {
             let old = [(FILE_NAME.to_owned(), old.to_vec())];
             let base = if start.is_multiple_of(8) { Image::from(old) } else { Image::new() };
-            sum += bench.history(base, &generations, luck)?;
+            sum += bench.history(base, fault, &generations, luck)?;
             tally.set(sum);
         }
         Ok(())
@@ -112,13 +121,20 @@ impl Bench {
     }
 
     /// Generations of a store: each begins with what a cut has left of the one before.
-    fn history(&self, base: Image, generations: &[Vec<Step>], luck: u64) -> Result<Tally, TestCaseError> {
+    fn history(
+        &self,
+        base: Image,
+        mut fault: Option<Fault>,
+        generations: &[Vec<Step>],
+        luck: u64,
+    ) -> Result<Tally, TestCaseError> {
         let mut rng = Pcg64Mcg::new(u128::from(luck));
         let mut tally = Tally::default();
+        let hashed = base.is_empty();
         let mut image = base;
         let mut contents = Rc::new(self.pristine(&image)?);
         for steps in generations {
-            let (disk, segments, done) = self.generation(&image, contents, steps)?;
+            let (disk, segments, done) = self.generation(&image, contents, fault.take(), steps)?;
             tally += done;
             let mut survivors = None;
             for _ in 0..CUTS {
@@ -131,6 +147,11 @@ impl Bench {
                 if segment.allowed.len() > 1 {
                     tally.cuts_within += 1;
                     tally.kept_within += u64::from(found != segment.allowed[0]);
+                }
+                if !self.lies && below(&mut rng, DAMAGE_ONE_IN) == 0 {
+                    let directory = memory();
+                    damage(directory.path(), &image, &found, hashed, &mut rng)?;
+                    tally.damaged += 1;
                 }
                 survivors = Some(found);
             }
@@ -152,6 +173,7 @@ impl Bench {
         &self,
         image: &Image,
         contents: Rc<Contents>,
+        fault: Option<Fault>,
         steps: &[Step],
     ) -> Result<(Disk, Vec<Segment>, Tally), TestCaseError> {
         let mut disk = Disk::new(image);
@@ -159,7 +181,7 @@ impl Bench {
             disk.lie();
         }
         mount(&self.at_work, disk);
-        let mut subject = Subject::open(self, contents)?;
+        let mut subject = Subject::open(self, contents, fault)?;
         for step in steps {
             subject.step(step)?;
         }
@@ -209,6 +231,64 @@ impl Bench {
         }
         Ok(found)
     }
+}
+
+/// A store as a cut has left it, on a real disk, with a damaged page: what is wrong is found, the rest is taken over, and
+/// nothing is there that was not stored. Models and fits of the first release are not `hashed`.
+fn damage(
+    directory: &Path,
+    image: &Image,
+    found: &Contents,
+    hashed: bool,
+    rng: &mut Pcg64Mcg,
+) -> Result<(), TestCaseError> {
+    if !image.contains_key(FILE_NAME) {
+        return Ok(());
+    }
+    for (name, content) in image {
+        let mut content = content.clone();
+        if name == FILE_NAME && !content.is_empty() {
+            let sector = below(rng, content.len().div_ceil(SECTOR)) * SECTOR;
+            let end = content.len().min(sector + SECTOR);
+            rng.fill_bytes(&mut content[sector..end]);
+        }
+        std::fs::write(directory.join(name), content).expect("a file");
+    }
+    let beyond = |error: &StoreError| {
+        matches!(
+            error,
+            StoreError::Corrupt { .. }
+                | StoreError::Database { .. }
+                | StoreError::Foreign { .. }
+                | StoreError::NewerSchema { .. }
+        )
+    };
+    let verified = match store::verify(directory) {
+        Ok(verified) => verified,
+        Err(error) => {
+            prop_assert!(beyond(&error), "{error}");
+            return Ok(());
+        }
+    };
+    if !verified.is_sound() {
+        match store::repair(directory) {
+            Ok(_) => {}
+            Err(error) => {
+                prop_assert!(beyond(&error), "{error}");
+                return Ok(());
+            }
+        }
+    }
+    let left = read(&expect(Store::open(directory))?)?;
+    let mut originals = found.recordings.iter();
+    prop_assert!(left.recordings.iter().all(|left| originals.any(|original| original == left)), "{}", describe(&left));
+    prop_assert_eq!(verified.trajectories.sound, left.recordings.len() as u64);
+    if hashed {
+        prop_assert!(left.models.iter().all(|(id, model)| found.models.get(id) == Some(model)), "{}", describe(&left));
+        prop_assert!(left.fits.iter().all(|(id, fit)| found.fits.get(id) == Some(fit)), "{}", describe(&left));
+        prop_assert!(!verified.is_sound() || left == *found, "{}", describe(&left));
+    }
+    Ok(())
 }
 
 /// An error may be the disk's alone.

@@ -36,7 +36,7 @@ pub enum Step {
     Record(Vec<Vec<Spec>>),
     /// Deletes what a filter selects.
     Delete(Selection),
-    /// Reads everything, and what a filter selects.
+    /// Counts, exports and scans everything, and what a filter selects.
     Read(Selection),
     /// Stores a model.
     PutModel(u8),
@@ -212,7 +212,8 @@ fn selection() -> impl Strategy<Value = Selection> {
     ]
 }
 
-fn fault() -> impl Strategy<Value = Fault> {
+/// How a disk fails.
+pub fn fault() -> impl Strategy<Value = Fault> {
     prop_oneof![(0_u32..40).prop_map(Fault::Read), (0_u32..40).prop_map(Fault::Write), (0_u32..6).prop_map(Fault::Sync),]
 }
 

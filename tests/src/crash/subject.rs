@@ -2,12 +2,15 @@
 
 use super::{
     check::{Bench, Tally, check_disk, describe, expect, read, recordings},
+    disk::Fault,
     history::{Contents, Selection, Spec, Step, fit, fit_ids, model},
     vfs::with_disk,
 };
+use bytes::Bytes;
 use mazeway_learner::store::{Filter, Put, Recording, Store, StoreError};
 use proptest::{prelude::*, test_runner::TestCaseError};
-use std::rc::Rc;
+use std::{ops::ControlFlow, path::Path, rc::Rc};
+use uuid::Uuid;
 
 /// What a store may hold if the power is cut from a moment on.
 pub(super) struct Segment {
@@ -37,12 +40,12 @@ enum Outcome {
 }
 
 impl<'a> Subject<'a> {
-    /// Opens the store on the disk that is mounted, which holds this.
-    pub(super) fn open(bench: &'a Bench, contents: Rc<Contents>) -> Result<Self, TestCaseError> {
+    /// Opens the store on the disk that is mounted, which holds this, and may fail at first.
+    pub(super) fn open(bench: &'a Bench, contents: Rc<Contents>, fault: Option<Fault>) -> Result<Self, TestCaseError> {
         let allowed = vec![Rc::clone(&contents)];
         Ok(Self {
             bench,
-            store: Some(expect(Bench::open(&bench.at_work))?),
+            store: Some(open_on(&bench.at_work, fault)?),
             visible: contents,
             segments: vec![Segment { from: 0, allowed: allowed.clone() }],
             allowed,
@@ -112,14 +115,7 @@ impl<'a> Subject<'a> {
             }
             Step::Reopen => {
                 drop(self.store.take());
-                self.store = Some(match Bench::open(&self.bench.at_work) {
-                    Ok(store) => store,
-                    Err(error) => {
-                        check_disk(&error)?;
-                        self.mend();
-                        expect(Bench::open(&self.bench.at_work))?
-                    }
-                });
+                self.store = Some(reopen(&self.bench.at_work)?);
                 same(self)
             }
             Step::Break(fault) => {
@@ -143,10 +139,7 @@ impl<'a> Subject<'a> {
     }
 
     fn mend(&self) {
-        with_disk(&self.bench.at_work, |disk| {
-            disk.set_fault(None);
-            disk.set_free(None);
-        });
+        mend(&self.bench.at_work);
     }
 
     /// Requests that share their commits as they come.
@@ -309,9 +302,52 @@ impl<'a> Subject<'a> {
                 Ok(found) => prop_assert!(found == expected, "read {} for {}", found.len(), expected.len()),
                 Err(error) => check_disk(&error)?,
             }
+            // As a fit reads: without the rewards.
+            let mut scanned = Vec::new();
+            let all = self.store().for_each(&filter, |stored| {
+                scanned.push(arrays(&stored.recording()));
+                ControlFlow::<()>::Continue(())
+            });
+            match all {
+                Ok(_) => {
+                    let expected = expected.iter().map(arrays).collect::<Vec<_>>();
+                    prop_assert!(scanned == expected, "scanned {} for {}", scanned.len(), expected.len());
+                }
+                Err(error) => check_disk(&error)?,
+            }
         }
         Ok(())
     }
+}
+
+/// What a fit reads of a trajectory.
+fn arrays(recording: &Recording) -> (Uuid, Bytes, Bytes) {
+    let arrays = recording.arrays();
+    (recording.id(), arrays.states.clone(), arrays.actions.clone())
+}
+
+/// Opens a store on a disk that may fail, which it may say; then the disk is mended.
+fn reopen(directory: &Path) -> Result<Store, TestCaseError> {
+    Bench::open(directory).or_else(|error| {
+        check_disk(&error)?;
+        mend(directory);
+        expect(Bench::open(directory))
+    })
+}
+
+/// As [`reopen`], on a disk that fails so and works again afterwards.
+fn open_on(directory: &Path, fault: Option<Fault>) -> Result<Store, TestCaseError> {
+    with_disk(directory, |disk| disk.set_fault(fault));
+    let store = reopen(directory)?;
+    mend(directory);
+    Ok(store)
+}
+
+fn mend(directory: &Path) {
+    with_disk(directory, |disk| {
+        disk.set_fault(None);
+        disk.set_free(None);
+    });
 }
 
 fn add(set: &mut Vec<Rc<Contents>>, contents: Rc<Contents>) {

@@ -3,7 +3,7 @@
 #   cuts N     cuts of the power (default 1000000)
 #   kills N    kill -9 of the service under a recording load (default 200)
 #   damage N   damaged files (default 10000)
-#   fuzz N     inputs of every target (default 10000000); SEED and TARGETS choose, KEEP=DIR keeps what led to new answers
+#   fuzz N     inputs of every target (default 10000000); TARGETS="NAME ..." chooses, SEED=N varies them
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 test() { cargo test --release --locked -p mazeway-tests --test "$1" "$2" -- --nocapture; }
@@ -12,8 +12,13 @@ case "${1:-}" in
     kills) MAZEWAY_KILLS=${2:-200} test kill what_was_acknowledged ;;
     damage) MAZEWAY_DAMAGES=${2:-10000} test damage whatever_page ;;
     fuzz)
+        # libFuzzer is guided by the edges that our own crates take, which a stable compiler counts.
+        host=$(rustc -vV | sed -n 's/^host: //p')
+        export CARGO_TARGET_DIR=target/fuzz/build
+        RUSTC_WORKSPACE_WRAPPER=$PWD/tests/bench/fuzz/instrument RUSTFLAGS='--cfg fuzzing --cfg fuzzing_libfuzzer' \
+            cargo build --profile fuzz --locked --target "$host" -p mazeway-bench-fuzz
         # shellcheck disable=SC2086
-        cargo run --release --locked -p mazeway-tests --example fuzz -- "${2:-10000000}" "${SEED:-1}" ${TARGETS:-}
+        "$CARGO_TARGET_DIR/$host/fuzz/fuzz" --runs "${2:-10000000}" --seed "${SEED:-1}" ${TARGETS:-}
         ;;
     *)
         sed -n '2,6s/^# //p' "$0" >&2

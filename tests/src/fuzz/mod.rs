@@ -88,9 +88,7 @@ pub fn run(
         });
         let took = begun.elapsed();
         let failure = match &answer {
-            Some(Ok(_)) if peak > MAX_BYTES => Some(format!("held {peak} bytes")),
-            Some(Ok(_)) if took > SLOW => Some(format!("took {took:?}")),
-            Some(Ok(_)) => None,
+            Some(Ok(_)) => judge(peak, took),
             Some(Err(_)) | None => Some("panicked".to_owned()),
         };
         if let Some(failure) = failure {
@@ -117,6 +115,14 @@ pub fn run(
     }
     tally.answers = seen.len();
     tally
+}
+
+/// What is wrong with an execution that held so many bytes at its peak and took so long.
+pub fn judge(peak_bytes: u64, took: Duration) -> Option<String> {
+    if peak_bytes > MAX_BYTES {
+        return Some(format!("held {peak_bytes} bytes"));
+    }
+    (took > SLOW).then(|| format!("took {took:?}"))
 }
 
 /// An answer without the numbers and the quoted names in it.

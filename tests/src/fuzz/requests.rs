@@ -4,7 +4,7 @@
 //! The first byte of an input chooses the method, the rest is the message. Where a message belongs into a stream, it comes
 //! after what makes it sensible: a reset before a step, a world joined before anything is done in it.
 
-use crate::{EnvServer, config, learner::LearnerServer, learner::trajectory};
+use crate::{EnvServer, config, learner::LearnerServer, learner::trajectory, memory};
 use bytes::Bytes;
 use mazeway_client::packed::pack;
 use mazeway_learner::config::Limits;
@@ -16,13 +16,15 @@ use mazeway_proto::{
 };
 use mazeway_server::Config;
 use prost::Message;
-use std::{cell::RefCell, path::Path, time::Duration};
+use std::{cell::RefCell, time::Duration};
 use tokio::{runtime::Runtime, time::timeout};
 use tonic::{Code, Request, Status, client::Grpc, codegen::http::uri::PathAndQuery, transport::Channel};
 
 /// Stands in inputs for the id of the session and the name of the world that are there.
 const SESSION: &[u8; 32] = b"session-session-session-session-";
-/// Messages of an answer that are read.
+/// Calls after which services begin anew, so that what was let in does not pile up.
+const CALLS: u32 = 200_000;
+/// Messages of an answer that are read; of those who watch one, as they wait for the next.
 const READ: usize = 4;
 /// Time that an answer may take, on a machine that is busy.
 const PATIENCE: Duration = Duration::from_secs(20);
@@ -38,6 +40,7 @@ struct Peers {
     learner: Channel,
     session: String,
     world: String,
+    calls: u32,
     _server: EnvServer,
     _learner: LearnerServer,
     _data: tempfile::TempDir,
@@ -45,9 +48,7 @@ struct Peers {
 
 impl Peers {
     fn start() -> Self {
-        let memory = Path::new("/dev/shm");
-        let data = if memory.is_dir() { tempfile::tempdir_in(memory) } else { tempfile::tempdir() };
-        let data = data.expect("a directory");
+        let data = memory();
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().expect("a runtime");
         let limits = Config { max_envs_per_session: 64, max_sessions: 100_000, max_total_envs: 1_000_000, ..config() };
         let server = EnvServer::with(Config { threads: 1, ..limits });
@@ -62,6 +63,7 @@ impl Peers {
             learner: of_learner,
             session: String::new(),
             world: String::new(),
+            calls: 0,
             _server: server,
             _learner: learner,
             _data: data,
@@ -91,6 +93,7 @@ impl Peers {
     fn ask(&self, path: &str, messages: Vec<Vec<u8>>) -> Result<Vec<Bytes>, Status> {
         let channel = if path.starts_with(LEARNER) { &self.learner } else { &self.environments };
         let mut grpc = Grpc::new(channel.clone());
+        let wanted = if path.ends_with("/Watch") { 1 } else { READ };
         let path: PathAndQuery = path.parse().expect("a path");
         let messages = tokio_stream::iter(messages.into_iter().map(Bytes::from).collect::<Vec<_>>());
         self.runtime.block_on(async {
@@ -98,7 +101,7 @@ impl Peers {
                 grpc.ready().await.map_err(|error| Status::unavailable(error.to_string()))?;
                 let mut answers = grpc.streaming(Request::new(messages), path, Raw).await?.into_inner();
                 let mut read = Vec::new();
-                while read.len() < READ
+                while read.len() < wanted
                     && let Some(message) = answers.message().await?
                 {
                     read.push(message);
@@ -133,7 +136,11 @@ fn tried(paths: &[(&str, &str)], bytes: &[u8]) -> Result<String, String> {
     let (service, method) = paths[usize::from(*method) % paths.len()];
     let path = format!("{service}{method}");
     PEERS.with_borrow_mut(|peers| {
+        if peers.as_ref().is_some_and(|peers| peers.calls == CALLS) {
+            *peers = None;
+        }
         let peers = peers.get_or_insert_with(Peers::start);
+        peers.calls += 1;
         let message = replaced(message, if service == WORLDS { &peers.world } else { &peers.session });
         let messages = match (service, method) {
             (_, "Interact") => {
@@ -191,7 +198,7 @@ impl Peers {
     }
 }
 
-const ENVIRONMENT_METHODS: [(&str, &str); 9] = [
+const ENVIRONMENT_METHODS: [(&str, &str); 11] = [
     (ENVIRONMENTS, "CreateSession"),
     (ENVIRONMENTS, "Reset"),
     (ENVIRONMENTS, "Step"),
@@ -201,9 +208,11 @@ const ENVIRONMENT_METHODS: [(&str, &str); 9] = [
     (ENVIRONMENTS, "CloseSession"),
     (ENVIRONMENTS, "GetModel"),
     (WORLDS, ""),
+    (ENVIRONMENTS, "ListEnvironments"),
+    (ENVIRONMENTS, "Watch"),
 ];
 
-const LEARNER_METHODS: [(&str, &str); 11] = [
+const LEARNER_METHODS: [(&str, &str); 12] = [
     (LEARNER, "RecordTrajectories"),
     (LEARNER, "PutModel"),
     (LEARNER, "GetModel"),
@@ -215,6 +224,7 @@ const LEARNER_METHODS: [(&str, &str); 11] = [
     (LEARNER, "GetFit"),
     (LEARNER, "ListFits"),
     (LEARNER, "ListFitTrajectories"),
+    (LEARNER, "DeleteFit"),
 ];
 
 /// A request to the environment server.
@@ -269,6 +279,8 @@ pub fn environment_seeds() -> Vec<Vec<u8>> {
         (8, worlds(Payload::Step(act))),
         (8, worlds(Payload::Reset(dm_env::ResetRequest::default()))),
         (8, worlds(Payload::DestroyWorld(dm_env::DestroyWorldRequest { world_name: session_id() }))),
+        (9, env::ListEnvironmentsRequest::default().encode_to_vec()),
+        (10, env::WatchRequest { session_id: session_id(), max_width: 50, ..Default::default() }.encode_to_vec()),
     ])
 }
 
@@ -288,5 +300,7 @@ pub fn learner_seeds() -> Vec<Vec<u8>> {
         (7, pb::FitRequest { filter: filter(), method: "bc".into(), ..Default::default() }.encode_to_vec()),
         (8, pb::GetFitRequest { fit_id: "0123abcd".into() }.encode_to_vec()),
         (9, pb::ListFitsRequest { page_size: 5, ..Default::default() }.encode_to_vec()),
+        (10, pb::ListFitTrajectoriesRequest { fit_id: "0123abcd".into(), ..Default::default() }.encode_to_vec()),
+        (11, pb::DeleteFitRequest { fit_id: "0123abcd".into() }.encode_to_vec()),
     ])
 }

@@ -3,7 +3,7 @@
 //! A reader checks what comes out as well: it has the shape that its type promises.
 
 use super::requests;
-use crate::learner::trajectory;
+use crate::{learner::trajectory, memory};
 use clap::CommandFactory as _;
 use mazeway_learner::{
     files::{Collector, Demonstration, Names, ParquetExport, ReadOptions, Step, read, read_model},
@@ -185,7 +185,7 @@ pub const TARGETS: [Target; 13] = [
     },
     Target { name: "settings-file", read: settings_file, seeds: settings_files, words: TOML, max_bytes: 2000 },
     Target { name: "tokens-file", read: tokens_file, seeds: tokens_files, words: TOML, max_bytes: 2000 },
-    Target { name: "store-file", read: store_file, seeds: store_files, words: DATABASE, max_bytes: 80_000 },
+    Target { name: "store-file", read: store_file, seeds: Vec::new, words: DATABASE, max_bytes: 40_000 },
 ];
 
 /// The target of a name.
@@ -224,14 +224,7 @@ fn directory() -> PathBuf {
     thread_local! {
         static DIRECTORY: RefCell<Option<tempfile::TempDir>> = const { RefCell::new(None) };
     }
-    DIRECTORY.with_borrow_mut(|directory| {
-        let made = directory.get_or_insert_with(|| {
-            let memory = Path::new("/dev/shm");
-            let made = if memory.is_dir() { tempfile::tempdir_in(memory) } else { tempfile::tempdir() };
-            made.expect("a directory")
-        });
-        made.path().to_owned()
-    })
+    DIRECTORY.with_borrow_mut(|directory| directory.get_or_insert_with(memory).path().to_owned())
 }
 
 fn demonstrations(name: &str, bytes: &[u8]) -> Result<String, String> {
@@ -357,15 +350,6 @@ fn model_message(bytes: &[u8]) -> Result<String, String> {
     let model = Model::new(header, rows).map_err(|error| error.to_string())?;
     assert_eq!(model.model_id().len(), 64);
     Ok("a model".into())
-}
-
-fn store_files() -> Vec<Vec<u8>> {
-    let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("data");
-    let mut files =
-        fs::read_dir(data).expect("a directory").map(|file| file.expect("a file").path()).collect::<Vec<_>>();
-    files.retain(|file| file.extension().is_some_and(|extension| extension == "sqlite3"));
-    files.sort();
-    files.iter().map(|file| fs::read(file).expect("a sample")).collect()
 }
 
 /// A database: checked, opened, read in every way, repaired.

@@ -1,0 +1,173 @@
+//! `fuzz`: feeds the readers of bytes from outside with inputs that libFuzzer makes, guided by the code that they reach.
+//!
+//! `tests/bench/reliability.sh fuzz` builds it with coverage, which a stable compiler gives, and runs every target. What leads to
+//! new code is kept under `target/fuzz/corpus`, where a later run begins. A panic, an execution that takes too much memory on its
+//! thread or too long (see [`judge`]), and a process of more than [`MAX_PROCESS_MIB`] end the run; the input is kept beside
+//! the log.
+
+use bolero::check;
+use clap::Parser;
+use comfy_table::{CellAlignment, Table, presets};
+use mazeway_tests::{
+    fuzz::{
+        SLOW, corpus, judge,
+        targets::{TARGETS, Target, find},
+    },
+    memory,
+};
+use std::{
+    env,
+    fs::{self, File},
+    io,
+    path::{Path, PathBuf},
+    process::{Command, ExitCode},
+    time::Instant,
+};
+
+/// Tells a child its target.
+const TARGET: &str = "MAZEWAY_FUZZ_TARGET";
+/// Tells it what libFuzzer is to do, as bolero has it.
+const ARGUMENTS: &str = "BOLERO_LIBFUZZER_ARGS";
+/// Of a process: its corpus, the services that it asks and what libFuzzer holds of them included.
+const MAX_PROCESS_MIB: u32 = 1024;
+
+#[derive(Debug, Parser)]
+#[command(about = "Fuzzes the readers of bytes from outside, guided by coverage")]
+struct Cli {
+    /// The targets; all where none is named.
+    #[arg(value_name = "TARGET", value_parser = target)]
+    targets: Vec<Target>,
+    /// Inputs of each target.
+    #[arg(long, default_value_t = 10_000_000, value_name = "N")]
+    runs: u64,
+    /// Where the mutations begin.
+    #[arg(long, default_value_t = 1, value_name = "N")]
+    seed: u32,
+    /// Where corpora, logs and failing inputs are kept.
+    #[arg(long, default_value = "target/fuzz", value_name = "DIR")]
+    work: PathBuf,
+}
+
+fn target(name: &str) -> Result<Target, String> {
+    let names = || TARGETS.map(|target| target.name).join(", ");
+    find(name).copied().ok_or_else(|| format!("expected one of {}", names()))
+}
+
+/// What libFuzzer has told at its end.
+struct Outcome {
+    inputs: u64,
+    covered: u64,
+    corpus: usize,
+    slowest_secs: u64,
+    peak_mib: u64,
+}
+
+fn main() -> ExitCode {
+    if let Ok(name) = env::var(TARGET) {
+        read_inputs(find(&name).expect("the name of a target"));
+        return ExitCode::SUCCESS;
+    }
+    let cli = Cli::parse();
+    let targets = if cli.targets.is_empty() { TARGETS.to_vec() } else { cli.targets };
+    let mut table = Table::new();
+    table.load_style(presets::ASCII_MARKDOWN);
+    table.set_header(["target", "inputs", "edges", "corpus", "slowest, s", "process, MiB", "took, s"]);
+    for column in table.column_iter_mut().skip(1) {
+        column.set_cell_alignment(CellAlignment::Right);
+    }
+    for target in targets {
+        let begun = Instant::now();
+        match fuzz(&target, cli.runs, cli.seed, &cli.work) {
+            Ok(outcome) => {
+                let Outcome { inputs, covered, corpus, slowest_secs, peak_mib } = outcome;
+                eprintln!("{}: {inputs} inputs, {covered} edges", target.name);
+                let numbers = [inputs, covered, corpus as u64, slowest_secs, peak_mib, begun.elapsed().as_secs()];
+                table.add_row([target.name.to_owned()].into_iter().chain(numbers.map(|number| number.to_string())));
+            }
+            Err(error) => {
+                eprintln!("{table}\nerror: {}: {error}", target.name);
+                return ExitCode::FAILURE;
+            }
+        }
+    }
+    println!("{table}");
+    ExitCode::SUCCESS
+}
+
+/// In a child: what libFuzzer makes is read.
+fn read_inputs(target: &'static Target) {
+    check!().with_max_len(target.max_bytes).for_each(|input| {
+        let begun = Instant::now();
+        let peak = allocation_counter::measure(|| drop((target.read)(input))).bytes_max;
+        if let Some(failure) = judge(peak, begun.elapsed()) {
+            panic!("{failure}");
+        }
+    });
+}
+
+/// Runs a child on a target until it has read so many inputs.
+fn fuzz(target: &Target, runs: u64, seed: u32, work: &Path) -> Result<Outcome, String> {
+    let text = |error: io::Error| error.to_string();
+    let kept = work.join("corpus").join(target.name);
+    let logs = work.join("logs");
+    for directory in [&kept, &logs] {
+        fs::create_dir_all(directory).map_err(text)?;
+    }
+    for (number, input) in corpus(target).iter().enumerate() {
+        fs::write(kept.join(format!("seed-{number:03}")), input).map_err(text)?;
+    }
+    let words = logs.join(format!("{}.dict", target.name));
+    fs::write(&words, dictionary(target.words)).map_err(text)?;
+    let log = logs.join(format!("{}-{seed}.log", target.name));
+    let arguments = [
+        kept.display().to_string(),
+        format!("-artifact_prefix={}/{}-", logs.display(), target.name),
+        format!("-dict={}", words.display()),
+        format!("-runs={runs}"),
+        format!("-seed={seed}"),
+        format!("-max_len={}", target.max_bytes),
+        format!("-timeout={}", SLOW.as_secs()),
+        format!("-rss_limit_mb={MAX_PROCESS_MIB}"),
+        "-reload=0".into(),
+        "-print_final_stats=1".into(),
+    ];
+    // A child ends without clearing up.
+    let temporary = memory();
+    let output = File::create(&log).map_err(text)?;
+    let status = Command::new(env::current_exe().map_err(text)?)
+        .env(TARGET, target.name)
+        .env(ARGUMENTS, arguments.join(" "))
+        .env("TMPDIR", temporary.path())
+        .stdout(output.try_clone().map_err(text)?)
+        .stderr(output)
+        .status()
+        .map_err(text)?;
+    let said = fs::read(&log).map_err(text)?;
+    let said = String::from_utf8_lossy(&said);
+    if !status.success() {
+        return Err(format!("{status}; see {}", log.display()));
+    }
+    let number = |name: &str| {
+        let line = said.lines().rev().find_map(|line| line.split_once(name))?;
+        line.1.split_whitespace().next()?.parse::<u64>().ok()
+    };
+    let told = (|| {
+        Some(Outcome {
+            inputs: number("stat::number_of_executed_units:")?,
+            covered: number(" cov: ")?,
+            corpus: fs::read_dir(&kept).ok()?.count(),
+            slowest_secs: number("stat::slowest_unit_time_sec:")?,
+            peak_mib: number("stat::peak_rss_mb:")?,
+        })
+    })();
+    told.ok_or_else(|| "built without libFuzzer: tests/bench/reliability.sh fuzz builds it".into())
+}
+
+/// Pieces of a format as libFuzzer reads them.
+fn dictionary(words: &[&[u8]]) -> String {
+    let quoted = |word: &&[u8]| {
+        let bytes = word.iter().map(|byte| format!("\\x{byte:02x}")).collect::<String>();
+        format!("\"{bytes}\"\n")
+    };
+    words.iter().map(quoted).collect()
+}

@@ -100,7 +100,7 @@ pub enum SessionError {
     #[error("the session is in use by another call or stream")]
     Busy,
     /// A limit is reached.
-    #[error("expected at most {limit} {what}, asked for {asked}")]
+    #[error("expected at most {limit} {what}, asked for {asked}{}", if *.shared { " more" } else { "" })]
     Limit {
         /// Field of the request that asks for it.
         field: &'static str,
@@ -108,8 +108,10 @@ pub enum SessionError {
         what: &'static str,
         /// The limit.
         limit: u64,
-        /// What was asked for, with what is in use.
+        /// What was asked for; with what the caller has already, unless the limit is shared.
         asked: u64,
+        /// Whether others share the limit. How much of it they have is not told.
+        shared: bool,
     },
     /// A lease outside the bounds.
     #[error("expected a lease above 0 and at most {max_secs} s, got {got_secs} s")]
@@ -267,23 +269,19 @@ impl Sessions {
             return Err(SessionError::Lease { max_secs: max_lease.as_secs_f64(), got_secs: lease.as_secs_f64() });
         }
         let limit = |field, what, limit: usize, asked: usize| {
-            if asked <= limit {
-                Ok(())
-            } else {
-                Err(SessionError::Limit { field, what, limit: limit as u64, asked: asked as u64 })
-            }
+            let error = || SessionError::Limit { field, what, limit: limit as u64, asked: asked as u64, shared: false };
+            if asked <= limit { Ok(()) } else { Err(error()) }
+        };
+        let shared = |field, what, limit: usize, used: usize, more: usize| {
+            let error = || SessionError::Limit { field, what, limit: limit as u64, asked: more as u64, shared: true };
+            if more <= limit.saturating_sub(used) { Ok(()) } else { Err(error()) }
         };
         limit("num_envs", "environments in a session", max_envs_per_session, num_envs)?;
         let id = SessionId::random()?;
         {
             let mut inner = self.lock();
-            limit("sessions", "sessions on this server", max_sessions, inner.slots.len() + 1)?;
-            limit(
-                "num_envs",
-                "environments on this server",
-                max_total_envs,
-                inner.total_envs.saturating_add(num_envs),
-            )?;
+            shared("sessions", "sessions on this server", max_sessions, inner.slots.len(), 1)?;
+            shared("num_envs", "environments on this server", max_total_envs, inner.total_envs, num_envs)?;
             let (sessions, envs) = inner.held.get(&holder.name).copied().unwrap_or_default();
             if let Some(max) = holder.max_sessions {
                 limit("sessions", "sessions of this caller", max, sessions + 1)?;

@@ -31,18 +31,20 @@ fn limits_hold_before_anything_is_made() {
     let (sessions, now) = (sessions(), Instant::now());
     let never = || -> Box<dyn Batch> { panic!("made in spite of the limit") };
     let limit = |error| match error {
-        SessionError::Limit { field, what, limit, asked } => (field, what, limit, asked),
+        SessionError::Limit { field, what, limit, asked, .. } => (field, what, limit, asked),
         other => panic!("{other:?}"),
     };
     let error = sessions.create(&Holder::anybody(), 11, None, now, never).unwrap_err();
     assert_eq!(limit(error), ("num_envs", "environments in a session", 10, 11));
     create(&sessions, 10, now).unwrap();
     let error = sessions.create(&Holder::anybody(), 6, None, now, never).unwrap_err();
-    assert_eq!(limit(error), ("num_envs", "environments on this server", 15, 16));
+    // What is there is nobody's business but its holder's.
+    assert_eq!(error.to_string(), "expected at most 15 environments on this server, asked for 6 more");
+    assert_eq!(limit(error), ("num_envs", "environments on this server", 15, 6));
     create(&sessions, 1, now).unwrap();
     let third = create(&sessions, 1, now).unwrap();
     let error = sessions.create(&Holder::anybody(), 1, None, now, never).unwrap_err();
-    assert_eq!(limit(error), ("sessions", "sessions on this server", 3, 4));
+    assert_eq!(limit(error), ("sessions", "sessions on this server", 3, 1));
     sessions.take(third, "", now, None).unwrap().close();
     create(&sessions, 1, now).unwrap();
 }
@@ -164,7 +166,7 @@ fn a_holder_has_its_quota_and_others_have_theirs() {
     let (sessions, now) = (sessions(), Instant::now());
     let alice = Holder { name: "alice".into(), max_sessions: Some(1), max_envs: Some(4) };
     let what = |error| match error {
-        SessionError::Limit { field, what, limit, asked } => (field, what, limit, asked),
+        SessionError::Limit { field, what, limit, asked, shared: false } => (field, what, limit, asked),
         other => panic!("{other:?}"),
     };
     let error = sessions.create(&alice, 5, None, now, || batch(5)).unwrap_err();

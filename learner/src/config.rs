@@ -1,7 +1,8 @@
 //! Settings of the learner service: where it keeps its data, limits and times.
 
+use clap::builder::RangedU64ValueParser;
 use mazeway_serving::DoorConfig;
-use std::{path::PathBuf, time::Duration};
+use std::{ops::RangeInclusive, path::PathBuf, time::Duration};
 
 /// Everything that a learner service can be told.
 #[derive(Debug, Clone, PartialEq)]
@@ -26,38 +27,44 @@ impl Config {
 #[command(next_help_heading = "Limits")]
 pub struct Limits {
     /// Largest message accepted or sent, in bytes
-    #[arg(long, default_value_t = 32 << 20, value_name = "BYTES")]
+    #[arg(long, default_value_t = 32 << 20, value_parser = count(MESSAGE_BYTES), value_name = "BYTES")]
     pub max_message_bytes: usize,
     /// Trajectories in one request
-    #[arg(long, default_value_t = 10_000, value_name = "N")]
+    #[arg(long, default_value_t = 10_000, value_parser = count(1..=u32::MAX.into()), value_name = "N")]
     pub max_trajectories_per_request: usize,
     /// Steps of one trajectory
-    #[arg(long, default_value_t = 1_000_000, value_name = "N")]
+    #[arg(long, default_value_t = 1_000_000, value_parser = count(1..=u32::MAX.into()), value_name = "N")]
     pub max_steps_per_trajectory: usize,
     /// Requests of one recording stream that wait for the disk; further ones wait on the wire
-    #[arg(long, default_value_t = 64, value_name = "N")]
+    #[arg(long, default_value_t = 64, value_parser = count(1..=65_536), value_name = "N")]
     pub max_requests_in_flight: usize,
     /// Bytes of the store in use from which recordings and models are refused; deleting, reading and fits go on [default:
     /// as many as the disk has]
     #[arg(long, value_name = "BYTES")]
     pub max_store_bytes: Option<u64>,
     /// State-action pairs of one model
-    #[arg(long, default_value_t = 4_000_000, value_name = "N")]
+    #[arg(long, default_value_t = 4_000_000, value_parser = clap::value_parser!(u64).range(1..), value_name = "N")]
     pub max_model_rows: u64,
     /// Transitions of one model
-    #[arg(long, default_value_t = 20_000_000, value_name = "N")]
+    #[arg(long, default_value_t = 20_000_000, value_parser = clap::value_parser!(u64).range(1..), value_name = "N")]
     pub max_model_transitions: u64,
+    /// Models that are taken in or given out at a time; further ones wait their turn
+    #[arg(long, default_value_t = 2, value_parser = count(1..=1024), value_name = "N")]
+    pub max_concurrent_models: usize,
+    /// Time for which the other end of a model's stream may do nothing; it has to keep up 64 KiB a second in the long run
+    #[arg(long, default_value = "30s", value_parser = duration, value_name = "TIME")]
+    pub model_patience: Duration,
     /// Fits that run at a time; further ones wait their turn
-    #[arg(long, default_value_t = 2, value_name = "N")]
+    #[arg(long, default_value_t = 2, value_parser = count(1..=1024), value_name = "N")]
     pub max_concurrent_fits: usize,
     /// Fits that wait their turn; callers with tokens take turns, and none of them takes all places
-    #[arg(long, default_value_t = 256, value_name = "N")]
+    #[arg(long, default_value_t = 256, value_parser = count(0..=1_000_000), value_name = "N")]
     pub max_queued_fits: usize,
     /// Iterations that a fit may ask for
-    #[arg(long, default_value_t = 1_000_000, value_name = "N")]
+    #[arg(long, default_value_t = 1_000_000, value_parser = clap::value_parser!(u32).range(1..), value_name = "N")]
     pub max_fit_iterations: u32,
     /// Calls and streams of one connection at a time
-    #[arg(long, default_value_t = 256, value_name = "N")]
+    #[arg(long, default_value_t = 256, value_parser = clap::value_parser!(u32).range(1..), value_name = "N")]
     pub max_streams_per_connection: u32,
     /// Time between HTTP/2 pings that find out whether a silent peer is still there
     #[arg(long, default_value = "10s", value_parser = duration, value_name = "TIME")]
@@ -78,6 +85,8 @@ impl Default for Limits {
             max_store_bytes: None,
             max_model_rows: 4_000_000,
             max_model_transitions: 20_000_000,
+            max_concurrent_models: 2,
+            model_patience: Duration::from_secs(30),
             max_concurrent_fits: 2,
             max_queued_fits: 256,
             max_fit_iterations: 1_000_000,
@@ -88,10 +97,21 @@ impl Default for Limits {
     }
 }
 
+/// Bytes that a message may have at most: enough for any call without an array, and no more than gRPC can count.
+const MESSAGE_BYTES: RangeInclusive<u64> = 1024..=i32::MAX as u64;
+
+/// A number within bounds.
+fn count(bounds: RangeInclusive<u64>) -> RangedU64ValueParser<usize> {
+    RangedU64ValueParser::new().range(bounds)
+}
+
+/// Longest time that any setting may be.
+const LONGEST: Duration = Duration::from_hours(365 * 24);
+
 fn duration(text: &str) -> Result<Duration, String> {
     match humantime::parse_duration(text) {
-        Ok(duration) if !duration.is_zero() => Ok(duration),
-        _ => Err("expected a time above 0 with its unit, such as 10s or 2m".into()),
+        Ok(duration) if !duration.is_zero() && duration <= LONGEST => Ok(duration),
+        _ => Err("expected a time above 0 and up to a year, with its unit, such as 10s or 2m".into()),
     }
 }
 

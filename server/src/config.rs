@@ -1,20 +1,21 @@
 //! Settings of a server: limits and times, each a flag, a variable and a key of the binary's file of settings.
 
 use crate::sessions::Limits;
+use clap::{CommandFactory as _, builder::RangedU64ValueParser};
 use mazeway_serving::{DoorConfig, ListenAddress, TelemetryConfig, config::seconds, token_command::TokenArgs};
-use std::{path::PathBuf, time::Duration};
+use std::{ops::RangeInclusive, path::PathBuf, time::Duration};
 
 /// Everything that a server can be told. [`Config::default`] has the defaults of the flags.
 #[derive(Debug, Clone, PartialEq, clap::Args)]
 pub struct Config {
     /// Sessions at a time; a further one is refused with `RESOURCE_EXHAUSTED`.
-    #[arg(long, default_value_t = 1024, value_name = "N")]
+    #[arg(long, default_value_t = 1024, value_parser = count(1..=ENOUGH), value_name = "N")]
     pub max_sessions: usize,
     /// Environments in one session.
-    #[arg(long, default_value_t = 16_384, value_name = "N")]
+    #[arg(long, default_value_t = 16_384, value_parser = count(1..=ENOUGH), value_name = "N")]
     pub max_envs_per_session: usize,
     /// Environments in all sessions together.
-    #[arg(long, default_value_t = 65_536, value_name = "N")]
+    #[arg(long, default_value_t = 65_536, value_parser = count(1..=ENOUGH), value_name = "N")]
     pub max_total_envs: usize,
     /// Lease of a session that asks for none, in seconds.
     #[arg(long = "default-lease-secs", default_value = "300", value_parser = seconds, value_name = "SECS")]
@@ -23,28 +24,28 @@ pub struct Config {
     #[arg(long = "max-lease-secs", default_value = "3600", value_parser = seconds, value_name = "SECS")]
     pub max_lease: Duration,
     /// Largest message accepted or sent, in bytes.
-    #[arg(long, default_value_t = 16 << 20, value_name = "BYTES")]
+    #[arg(long, default_value_t = 16 << 20, value_parser = count(1024..=i32::MAX as u64), value_name = "BYTES")]
     pub max_message_bytes: usize,
     /// Roll-outs that run at a time; a further one is refused with `RESOURCE_EXHAUSTED`.
-    #[arg(long, default_value_t = 8, value_name = "N")]
+    #[arg(long, default_value_t = 8, value_parser = count(0..=1024), value_name = "N")]
     pub max_concurrent_rollouts: usize,
     /// Steps of one roll-out in all, burn-in included.
-    #[arg(long, default_value_t = 1_000_000_000, value_name = "N")]
+    #[arg(long, default_value_t = 1_000_000_000, value_parser = clap::value_parser!(u64).range(1..), value_name = "N")]
     pub max_rollout_steps: u64,
     /// Viewers of one session at a time; a further one is refused with `RESOURCE_EXHAUSTED`.
-    #[arg(long, default_value_t = 64, value_name = "N")]
+    #[arg(long, default_value_t = 64, value_parser = count(0..=ENOUGH), value_name = "N")]
     pub max_viewers_per_session: usize,
     /// Viewers of all sessions together.
-    #[arg(long, default_value_t = 256, value_name = "N")]
+    #[arg(long, default_value_t = 256, value_parser = count(0..=ENOUGH), value_name = "N")]
     pub max_viewers: usize,
     /// Models that are computed at a time; further callers wait.
-    #[arg(long, default_value_t = 2, value_name = "N")]
+    #[arg(long, default_value_t = 2, value_parser = count(1..=1024), value_name = "N")]
     pub max_concurrent_models: usize,
     /// Calls and streams of one connection at a time; a further one waits, so leave room for more than its sessions.
-    #[arg(long, default_value_t = 2048, value_name = "N")]
+    #[arg(long, default_value_t = 2048, value_parser = clap::value_parser!(u32).range(1..), value_name = "N")]
     pub max_streams_per_connection: u32,
     /// Threads that serve connections, each connection on one of them; 0: as many as there are cores.
-    #[arg(long, default_value_t = 0, value_name = "N")]
+    #[arg(long, default_value_t = 0, value_parser = count(0..=1024), value_name = "N")]
     pub threads: usize,
     /// Microseconds for which a thread that has read something looks for more before it sleeps, where that has paid before;
     /// 0: it sleeps at once.
@@ -111,6 +112,21 @@ impl Config {
     }
 }
 
+/// More than any server has room for, and few enough to be counted everywhere.
+const ENOUGH: u64 = 1 << 30;
+
+/// A number within bounds.
+fn count(bounds: RangeInclusive<u64>) -> RangedU64ValueParser<usize> {
+    RangedU64ValueParser::new().range(bounds)
+}
+
+/// The settings of the door within bounds: with less, nobody could come in or call. For any command that has them.
+pub fn bounded(command: clap::Command) -> clap::Command {
+    command
+        .mut_arg("max_connections", |arg| arg.value_parser(count(1..=ENOUGH)))
+        .mut_arg("max_metadata_bytes", |arg| arg.value_parser(clap::value_parser!(u32).range(1024..=1 << 24)))
+}
+
 /// What begins the name of every variable: `MAZEWAY_SERVER_MAX_SESSIONS` is `--max-sessions`.
 pub const VARIABLES: &str = "MAZEWAY_SERVER_";
 
@@ -132,6 +148,11 @@ pub struct Cli {
     /// Everything that can be set.
     #[command(flatten)]
     pub settings: Settings,
+}
+
+/// The command line as it is parsed.
+pub fn command() -> clap::Command {
+    bounded(Cli::command()).mut_subcommand("config", bounded)
 }
 
 /// What the binary does beside serving.

@@ -1,14 +1,16 @@
 //! The environment server's binary.
 
-use clap::CommandFactory as _;
 use mazeway_server::{
     Listener,
-    config::{Cli, Command, PLACES, Settings, VARIABLES},
+    config::{Cli, Command, PLACES, Settings, VARIABLES, command},
     serve_observed,
 };
 use mazeway_serving::{
     settings::{self, SettingsError},
-    telemetry::{endpoint, logs},
+    telemetry::{
+        endpoint::{self, Endpoint},
+        logs,
+    },
 };
 use std::{
     env,
@@ -23,7 +25,7 @@ use std::{
 static ALLOCATOR: tikv_jemallocator::Jemalloc = tikv_jemallocator::Jemalloc;
 
 fn main() -> ExitCode {
-    let parsed = settings::parse(Cli::command(), VARIABLES, &PLACES, env::args_os());
+    let parsed = settings::parse(command(), VARIABLES, &PLACES, env::args_os());
     let (cli, settings) = match parsed.and_then(|settings| Ok((settings.typed::<Cli>()?, settings))) {
         Ok(parsed) => parsed,
         Err(SettingsError::Usage(error)) if !error.use_stderr() => {
@@ -31,11 +33,7 @@ fn main() -> ExitCode {
             let _ = error.print();
             return ExitCode::SUCCESS;
         }
-        Err(SettingsError::Usage(error)) => {
-            let text = error.to_string();
-            let message = text.lines().next().unwrap_or_default();
-            return refuse(2, message.strip_prefix("error: ").unwrap_or(message), "see 'server --help'");
-        }
+        Err(SettingsError::Usage(error)) => return misused(&error),
         Err(error) => return refuse(2, &error.to_string(), "see what there is with 'server config'"),
     };
     let cli = match cli.command {
@@ -65,6 +63,17 @@ fn main() -> ExitCode {
         Err(error) => return refuse(1, &format!("no threads to run on: {error}"), "raise the limit on processes"),
     };
     runtime.block_on(run(cli))
+}
+
+/// clap's several paragraphs in two lines.
+fn misused(error: &clap::Error) -> ExitCode {
+    let text = error.to_string();
+    // The first says what is wrong, and may name the arguments that are missing on lines of their own.
+    let first = text.split("\n\n").next().unwrap_or_default();
+    let message = first.split_whitespace().collect::<Vec<_>>().join(" ");
+    let asked = env::args().nth(1).filter(|word| command().find_subcommand(word).is_some());
+    let program = asked.map_or_else(|| "server".to_owned(), |word| format!("server {word}"));
+    refuse(2, message.strip_prefix("error: ").unwrap_or(&message), &format!("see '{program} --help'"))
 }
 
 /// Writes what was asked for. A closed pipe is not a failure: the reader has seen enough.
@@ -111,16 +120,24 @@ async fn observed(cli: Settings) -> ExitCode {
         Err(error) => return refuse(1, &format!("cannot catch signals: {error}"), "raise the limit on open files"),
     };
     let address = listener.address().unwrap_or(cli.listen);
-    // Whoever started this may have closed the other end; the server serves all the same.
-    let _ = writeln!(io::stdout(), "listening on {address}").and_then(|()| io::stdout().flush());
-    if let Some(shown) = &shown {
-        let _ =
-            writeln!(io::stdout(), "metrics on http://{}/metrics", shown.address()).and_then(|()| io::stdout().flush());
-    }
-    match serve_observed(cli.limits, listener, telemetry, stop).await {
+    // First polled when everything has started: who reads the lines may connect.
+    let numbers = shown.as_ref().map(Endpoint::address);
+    let told_to_stop = async move {
+        say(&format!("listening on {address}"));
+        if let Some(numbers) = numbers {
+            say(&format!("metrics on http://{numbers}/metrics"));
+        }
+        stop.await;
+    };
+    match serve_observed(cli.limits, listener, telemetry, told_to_stop).await {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => refuse(1, &error.to_string(), "add --log info to see more"),
     }
+}
+
+/// Writes a line. Whoever started this may have closed the other end; the server serves all the same.
+fn say(line: &str) {
+    let _ = writeln!(io::stdout(), "{line}").and_then(|()| io::stdout().flush());
 }
 
 /// SIGINT or SIGTERM, caught from this call on.

@@ -96,6 +96,54 @@ fn what_is_wrong_is_said_in_a_line_with_what_to_do() {
 }
 
 #[test]
+fn numbers_out_of_bounds_are_refused_wherever_they_come_from() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let most = u64::MAX.to_string();
+    let both = [("max-connections", "0"), ("max-metadata-bytes", "0"), ("max-message-bytes", "0")];
+    let of_server = [
+        ("max-sessions", "0"),
+        ("max-envs-per-session", "0"),
+        ("max-total-envs", "0"),
+        ("max-streams-per-connection", "0"),
+        ("max-concurrent-models", "0"),
+        ("max-concurrent-models", &most),
+        ("max-concurrent-rollouts", &most),
+        ("max-viewers", &most),
+        ("max-message-bytes", &most),
+        ("threads", "1000000"),
+    ];
+    let of_learner = [
+        ("max-concurrent-fits", "0"),
+        ("max-concurrent-fits", "1000000"),
+        ("max-concurrent-models", "0"),
+        ("max-concurrent-models", &most),
+        ("max-requests-in-flight", "0"),
+        ("max-requests-in-flight", &most),
+        ("max-queued-fits", &most),
+        ("max-streams-per-connection", "0"),
+        ("max-trajectories-per-request", "0"),
+        ("keepalive", "1000000years"),
+        ("shutdown-grace", "0s"),
+        ("model-patience", "0s"),
+    ];
+    for (program, prefix, own) in
+        [("server", "MAZEWAY_SERVER_", &of_server[..]), ("learner", "MAZEWAY_LEARNER_", &of_learner[..])]
+    {
+        for (key, value) in both.iter().chain(own) {
+            let (flag, variable) = (format!("--{key}"), format!("{prefix}{}", key.to_uppercase().replace('-', "_")));
+            refused(config(program).args([&flag, *value]), key);
+            refused(config(program).env(&variable, value), key);
+            let path = file(&directory, &format!("{key} = \"{value}\"\n"));
+            refused(config(program).args(["--config", &path]), key);
+            // And where it serves.
+            let mut serving = Command::new(mazeway_tests::programs::program(program));
+            let serve: &[&str] = if program == "learner" { &["serve"] } else { &[] };
+            refused(serving.args(serve).args(["--listen", "127.0.0.1:0", &flag, *value]), key);
+        }
+    }
+}
+
+#[test]
 fn every_setting_is_documented_with_its_default() {
     let docs = Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join("docs").join("CONFIGURATION.md");
     let docs = fs::read_to_string(docs).expect("the page");

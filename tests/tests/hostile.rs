@@ -5,7 +5,8 @@ use mazeway_client::{ClientError, Code, channel, packed::pack};
 use mazeway_proto::env::{
     self as pb, environment_service_client::EnvironmentServiceClient, rollout_request::Controller,
 };
-use mazeway_tests::EnvServer;
+use mazeway_server::Config;
+use mazeway_tests::{EnvServer, config};
 use prost_types::{ListValue, Struct, Value, value::Kind};
 use std::fmt::Debug;
 use tonic::{Status, transport::Channel};
@@ -168,5 +169,47 @@ async fn arrays_of_every_length_are_checked_before_they_are_read() {
         let lease = Some(prost_types::Duration { seconds, nanos });
         let request = pb::CreateSessionRequest { lease, ..session("Maze-v0", Struct::default()) };
         refused(service.create_session(request).await, Code::InvalidArgument, "lease");
+    }
+}
+
+#[tokio::test]
+async fn limits_beyond_all_numbers_are_as_good_as_none() {
+    let most = usize::MAX;
+    let config = Config {
+        max_sessions: most,
+        max_envs_per_session: most,
+        max_total_envs: most,
+        max_concurrent_rollouts: most,
+        max_concurrent_models: most,
+        max_viewers: most,
+        ..config()
+    };
+    let server = EnvServer::with(config);
+    let mut service = service(&server).await;
+    service.create_session(session("Maze-v0", Struct::default())).await.expect("a session");
+    let model = pb::GetModelRequest { env_id: "Maze-v0".into(), options: None };
+    service.get_model(model).await.expect("a model");
+    let rollout = pb::RolloutRequest {
+        env_id: "Maze-v0".into(),
+        controller: Some(Controller::Driver("random".into())),
+        episodes: 1,
+        steps: 1,
+        ..Default::default()
+    };
+    service.rollout(rollout).await.expect("a roll-out");
+}
+
+#[tokio::test]
+async fn a_caller_learns_no_more_of_the_others_than_that_there_is_no_room() {
+    let server = EnvServer::with(Config { max_total_envs: 10_000, ..config() });
+    let mut service = service(&server).await;
+    let of = |num_envs| pb::CreateSessionRequest { num_envs, ..session("Maze-v0", Struct::default()) };
+    service.create_session(of(7_654)).await.expect("a session");
+    let error = service.create_session(of(3_000)).await.expect_err("no room");
+    let (message, details) = (error.message(), String::from_utf8_lossy(error.details()));
+    assert!(message.contains("10000") && message.contains("3000 more"), "{message}");
+    // Neither what others have, nor what it would make.
+    for told in ["7654", "10654"] {
+        assert!(!message.contains(told) && !details.contains(told), "{message}");
     }
 }

@@ -142,6 +142,12 @@ pub fn unreachable(error: &ClientError, start: impl Into<String>) -> CliError {
     }
 }
 
+/// The command line as it is parsed.
+fn command() -> clap::Command {
+    let places = serve::PLACES.into_iter().flatten();
+    places.fold(Cli::command(), |command, place| command.mut_subcommand(place, mazeway_server::config::bounded))
+}
+
 /// Whether a word names a command.
 fn is_command(word: &str) -> bool {
     Cli::command().get_subcommands().any(|command| command.get_name() == word)
@@ -160,14 +166,15 @@ pub fn data_directory(asked: Option<PathBuf>) -> Result<PathBuf, CliError> {
 
 /// Parses the arguments, runs the command and says how it went.
 pub fn main() -> ExitCode {
-    let parsed = settings::parse(Cli::command(), serve::VARIABLES, &serve::PLACES, std::env::args_os());
+    let parsed = settings::parse(command(), serve::VARIABLES, &serve::PLACES, std::env::args_os());
     let (cli, settings) = match parsed.and_then(|settings| Ok((settings.typed::<Cli>()?, settings))) {
         Ok(parsed) => parsed,
         Err(SettingsError::Usage(error)) => return error::report_usage(&error),
         Err(error) => return CliError::usage(error.to_string(), "see what there is with 'learner config'").report(),
     };
     if !matches!(cli.command, Command::Serve(_)) {
-        let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("error"));
+        // What a service that was started for this command logs is told by the error and its hint.
+        let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("off"));
         tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
     }
     let runtime = match tokio::runtime::Builder::new_multi_thread().enable_all().build() {

@@ -2,9 +2,11 @@
 
 use super::{data_directory, error::CliError};
 use clap::Args;
-use mazeway_learner::{Config, config::Limits, store::Store};
+use mazeway_learner::{Config, config::Limits};
 use mazeway_serving::{
-    DoorConfig, ListenAddress, Listener, TelemetryConfig, telemetry::endpoint, token_command::TokenArgs,
+    DoorConfig, ListenAddress, Listener, TelemetryConfig,
+    telemetry::endpoint::{self, Endpoint},
+    token_command::TokenArgs,
 };
 use std::{io::Write as _, path::PathBuf, sync::Arc};
 
@@ -74,8 +76,6 @@ pub async fn run(args: ServeArgs) -> Result<(), CliError> {
         ));
     }
     let data = data_directory(data)?;
-    // A directory that cannot be used is said before the address is: who reads the line may connect.
-    drop(Store::open(&data)?);
     let cannot =
         |error: std::io::Error| CliError::failure(format!("cannot listen on {listen}: {error}"), listen.otherwise());
     let no_signals =
@@ -96,14 +96,22 @@ pub async fn run(args: ServeArgs) -> Result<(), CliError> {
     if let Err(error) = rayon::ThreadPoolBuilder::new().start_handler(yielding).build_global() {
         tracing::debug!(%error, "threads that compute have the priority of all others");
     }
-    // Whoever started this may have closed the other end; the service serves all the same.
-    let _ = writeln!(std::io::stdout(), "listening on {address}").and_then(|()| std::io::stdout().flush());
-    if let Some(shown) = &shown {
-        let _ = writeln!(std::io::stdout(), "metrics on http://{}/metrics", shown.address())
-            .and_then(|()| std::io::stdout().flush());
-    }
-    mazeway_learner::serve_observed(Config { data, limits, door }, listener, numbers, stopped).await?;
+    let metrics = shown.as_ref().map(Endpoint::address);
+    // First polled when everything has started: who reads the lines may connect.
+    let told_to_stop = async move {
+        say(&format!("listening on {address}"));
+        if let Some(metrics) = metrics {
+            say(&format!("metrics on http://{metrics}/metrics"));
+        }
+        stopped.await;
+    };
+    mazeway_learner::serve_observed(Config { data, limits, door }, listener, numbers, told_to_stop).await?;
     Ok(())
+}
+
+/// Writes a line. Whoever started this may have closed the other end; the service serves all the same.
+fn say(line: &str) {
+    let _ = writeln!(std::io::stdout(), "{line}").and_then(|()| std::io::stdout().flush());
 }
 
 /// SIGINT or SIGTERM. They are watched from the call on, not only once the future is waited for.

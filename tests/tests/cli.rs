@@ -13,7 +13,11 @@ use std::{io::Read as _, path::Path, process::Stdio};
 use tempfile::TempDir;
 
 fn learner(arguments: &[&str]) -> Command {
-    let mut command = Command::new(program("learner"));
+    command("learner", arguments)
+}
+
+fn command(name: &str, arguments: &[&str]) -> Command {
+    let mut command = Command::new(program(name));
     for (name, _) in std::env::vars().filter(|(name, _)| name.starts_with("MAZEWAY_") || name == "RUST_LOG") {
         command.env_remove(name);
     }
@@ -79,6 +83,65 @@ fn wrong_usage_is_one_error_and_one_hint() {
         let said = refused(learner(arguments), 2);
         assert!(said.0.starts_with(error), "{arguments:?}: {said:?}");
         assert!(said.1.contains(hint), "{arguments:?}: {said:?}");
+    }
+}
+
+#[test]
+fn a_token_that_is_asked_for_wrongly_is_a_wrong_call_of_either_program() {
+    for name in ["server", "learner"] {
+        let cases: [(&[&str], &str); 6] = [
+            (&["token"], "the following required arguments were not provided: --scopes <SCOPES> <NAME>"),
+            (&["token", "me"], "the following required arguments were not provided: --scopes <SCOPES>"),
+            (&["token", "a b", "--scopes", "act"], "invalid value 'a b' for '<NAME>': expected 1 to 64 letters"),
+            (&["token", "me", "--scopes", "all"], "invalid value 'all' for '--scopes <SCOPES>'"),
+            (
+                &["token", "me", "--scopes", "act", "--expires-in", "1000000y"],
+                "invalid value '1000000y' for '--expires-in <TIME>': expected a time above 0 and up to a hundred years",
+            ),
+            (&["token", "me", "--scopes", "act", "--expires-in", "0s"], "invalid value '0s' for '--expires-in <TIME>'"),
+        ];
+        for (arguments, error) in cases {
+            let said = refused(command(name, arguments), 2);
+            assert!(said.0.starts_with(error), "{name} {arguments:?}: {said:?}");
+            assert_eq!(said.1, format!("see '{name} token --help'"), "{arguments:?}");
+        }
+    }
+    let said = refused(command("server", &["--lissten", "127.0.0.1:0"]), 2);
+    assert_eq!(said.1, "see 'server --help'");
+}
+
+#[test]
+fn a_file_of_which_nothing_reads_is_to_be_restored() {
+    let data = tempfile::tempdir().expect("a directory");
+    let file = data.path().join("mazeway.sqlite3");
+    // Nothing at all, and nothing that is a database.
+    for (content, error) in [(String::new(), "there is nothing in it"), ("no database".repeat(200), "not a database")] {
+        std::fs::write(&file, &content).expect("a file");
+        for arguments in [&["verify"][..], &["repair"]] {
+            let said = refused(in_directory(data.path(), arguments), 1);
+            assert!(said.0.contains(error), "{arguments:?}: {said:?}");
+            assert!(said.1.starts_with("restore a copy"), "{arguments:?}: {said:?}");
+        }
+        let output = in_directory(data.path(), &["verify", "--json"]).output().expect("a process");
+        let object: Value = serde_json::from_slice(&output.stdout).expect("JSON");
+        assert_eq!((output.status.code(), &object["sound"]), (Some(1), &Value::Bool(false)), "{object}");
+        assert_eq!(std::fs::read(&file).expect("a file"), content.as_bytes(), "it is left alone");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_service_that_fails_within_a_command_is_told_in_two_lines() {
+    let data = recorded().await;
+    said(in_directory(data.path(), &["vacuum"]));
+    let file = data.path().join("mazeway.sqlite3");
+    let mut bytes = std::fs::read(&file).expect("a database");
+    // The schema reads, and nothing else.
+    let page = 8192;
+    bytes[page..].fill(0xaa);
+    std::fs::write(&file, &bytes).expect("a file");
+    for arguments in [&["list"][..], &["export"]] {
+        let (error, hint) = refused(in_directory(data.path(), arguments), 1);
+        assert!(hint.contains("learner verify"), "{arguments:?}: {error}; {hint}");
     }
 }
 

@@ -4,7 +4,7 @@
 
 use super::{data_directory, error::CliError, table::table};
 use clap::Args;
-use mazeway_learner::store::{self, Kind, Repair, Store, Tally, Verification};
+use mazeway_learner::store::{self, Kind, Repair, Store, StoreError, Tally, Verification};
 use serde_json::{Value, json};
 use std::{
     io::Write as _,
@@ -40,8 +40,14 @@ pub struct BackupArgs {
 pub async fn verify(args: MaintainArgs) -> Result<(), CliError> {
     let directory = data_directory(args.data)?;
     let found = blocking(move || store::verify(&directory)).await?;
-    tell(args.json, &json!({ "sound": found.is_sound(), "found": found }), &text(&found))?;
-    if found.is_sound() {
+    let nothing = nothing(&found);
+    let sound = found.is_sound() && nothing.is_none();
+    let said = if nothing.is_some() { String::new() } else { text(&found) };
+    tell(args.json, &json!({ "sound": sound, "found": found }), &said)?;
+    if let Some(error) = nothing {
+        return Err(error);
+    }
+    if sound {
         return Ok(());
     }
     Err(CliError::failure(
@@ -53,7 +59,17 @@ pub async fn verify(args: MaintainArgs) -> Result<(), CliError> {
 /// Writes a new store of what is sound in a damaged one.
 pub async fn repair(args: MaintainArgs) -> Result<(), CliError> {
     let directory = data_directory(args.data)?;
-    let Repair { found, kept } = blocking(move || store::repair(&directory)).await?;
+    let repaired = blocking(move || Ok(store::repair(&directory))).await?;
+    let Repair { found, kept } = repaired.map_err(|error| match error {
+        // `learner verify` would say no more.
+        StoreError::Corrupt { .. } => CliError::failure(error.to_string(), RESTORE),
+        error => error.into(),
+    })?;
+    if kept.is_none()
+        && let Some(error) = nothing(&found)
+    {
+        return Err(error);
+    }
     let said = match &kept {
         None => "nothing to repair\n".to_owned(),
         Some(kept) => format!(
@@ -72,6 +88,9 @@ pub async fn backup(args: BackupArgs) -> Result<(), CliError> {
     let directory = data_directory(args.common.data)?;
     let destination = args.destination;
     let found = blocking(move || store::backup(&directory, &destination)).await?;
+    if let Some(error) = nothing(&found) {
+        return Err(error);
+    }
     let bytes = std::fs::metadata(&found.path)?.len();
     let said = format!("copied      {bytes} bytes, on stable storage and checked\n");
     tell(
@@ -110,6 +129,24 @@ async fn blocking<T: Send + 'static>(
 ) -> Result<T, CliError> {
     let outcome = spawn_blocking(work).await;
     Ok(outcome.map_err(|error| CliError::failure(error.to_string(), "report this as a defect"))??)
+}
+
+/// What to do where nothing can be taken over.
+const RESTORE: &str = "restore a copy that 'learner backup' made, or move the file away: a service begins a new one";
+
+/// What there is to say of a file in which there is nothing to verify, repair or copy.
+fn nothing(found: &Verification) -> Option<CliError> {
+    let tallies = [found.trajectories, found.models, found.fits];
+    // A store knows its schema from the moment in which it is made.
+    if found.schema != 0 || tallies.iter().any(|tally| tally.sound + tally.damaged > 0) {
+        return None;
+    }
+    let path = found.path.display();
+    let message = match found.structure.first() {
+        None => format!("{path} is no store: there is nothing in it"),
+        Some(finding) => format!("nothing of {path} reads: {finding}"),
+    };
+    Some(CliError::failure(message, RESTORE))
 }
 
 fn tell(as_json: bool, value: &Value, text: &str) -> Result<(), CliError> {

@@ -4,12 +4,15 @@ use mazeway_client::{
     ClientError, Code, ConnectOptions, Demonstration, Learner, Model, Options, Recorder, Token, packed::Packed,
     packed::pack,
 };
-use mazeway_learner::{Config, config::Limits};
+use mazeway_learner::{Config, ServeError, config::Limits};
 use mazeway_proto::{
     env::{ModelPart, model_part::Part},
     learner::{self as pb, fit_response::Event, learner_service_client::LearnerServiceClient},
 };
-use mazeway_serving::grant::{Quotas, Scope};
+use mazeway_serving::{
+    Listener, Telemetry,
+    grant::{Quotas, Scope},
+};
 use mazeway_tests::{
     EnvServer,
     authority::Authority,
@@ -17,14 +20,25 @@ use mazeway_tests::{
 };
 use serde_json::Value;
 use sha2::{Digest as _, Sha256};
-use std::{path::Path, time::Duration};
+use std::{
+    path::Path,
+    sync::Arc,
+    time::{Duration, Instant},
+};
 use tempfile::TempDir;
-use tokio::time::timeout;
+use tokio::{
+    sync::{Notify, mpsc},
+    task::JoinHandle,
+    time::{sleep, timeout},
+};
+use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Status, transport::Channel};
 use uuid::Uuid;
 
 /// Time within which anything here ends, unless it hangs.
 const PATIENCE: Duration = Duration::from_mins(1);
+/// Time within which anything ends that waits for nobody else.
+const SOON: Duration = Duration::from_secs(20);
 
 /// Makes a trajectory wrong.
 type TrajectoryChange = fn(&mut pb::Trajectory);
@@ -318,6 +332,111 @@ async fn models_are_verified_named_and_stored_once() {
         assert_eq!(blame(&error), (Code::InvalidArgument, field.into()), "{error}");
     }
     assert_eq!(learner.list_models("").await.expect("models").len(), 1);
+}
+
+/// A stream of `PutModel` whose sender has the sending half: what is not sent, it says nothing of.
+async fn putting(
+    server: &LearnerServer,
+    first: Option<ModelPart>,
+) -> (mpsc::Sender<pb::PutModelRequest>, JoinHandle<Result<pb::PutModelResponse, Status>>) {
+    let (parts, stream) = mpsc::channel(1);
+    let mut client = raw(server).await;
+    let call = tokio::spawn(async move {
+        let answer = client.put_model(ReceiverStream::new(stream)).await;
+        answer.map(tonic::Response::into_inner)
+    });
+    if let Some(part) = first {
+        parts.send(pb::PutModelRequest { part: Some(part), replace: false }).await.expect("a stream");
+    }
+    (parts, call)
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn models_that_nobody_sends_keep_nobody_waiting() {
+    let (_data, server) = start();
+    let mut silent = Vec::new();
+    for _ in 0..20 {
+        silent.push(putting(&server, None).await);
+    }
+    // They have arrived.
+    sleep(Duration::from_millis(300)).await;
+    let learner = server.client().await;
+    let model = timeout(SOON, demonstrate(&learner)).await.expect("no wait for a model that nobody sends");
+    timeout(SOON, learner.model(&model.model_id)).await.expect("no wait").expect("the model");
+    let request = pb::FitRequest {
+        method: "bc".into(),
+        filter: Some(pb::TrajectoryFilter { style: "goals".into(), ..Default::default() }),
+        ..Default::default()
+    };
+    timeout(SOON, learner.fit(request, |_| ())).await.expect("no wait").expect("a fit");
+    // Whoever has waited long with its first part may still send it.
+    let (parts, call) = silent.pop().expect("one of them");
+    for part in model.parts() {
+        parts.send(pb::PutModelRequest { part: Some(part), replace: false }).await.expect("a stream");
+    }
+    drop(parts);
+    let answer = timeout(PATIENCE, call).await.expect("an answer").expect("a task").expect("a model");
+    assert!(answer.already_stored);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_model_whose_sender_or_reader_falls_silent_is_given_up() {
+    let data = tempfile::tempdir().expect("a directory");
+    let limits = Limits { max_concurrent_models: 1, model_patience: Duration::from_millis(500), ..Limits::default() };
+    let server = LearnerServer::with(data.path(), limits);
+    let learner = server.client().await;
+    let large = everywhere(500, 4);
+    let (parts, call) = putting(&server, Some(large[0].clone())).await;
+    sleep(Duration::from_millis(100)).await;
+    let model_id = timeout(SOON, learner.put_model_parts(large)).await.expect("its turn").expect("a model").model_id;
+    let status = timeout(SOON, call).await.expect("an end").expect("a task").expect_err("it is given up");
+    assert_eq!(status.code(), Code::DeadlineExceeded, "{status}");
+    drop(parts);
+    // Larger than what may be under way: the rest waits for a reader that reads nothing.
+    let request = pb::GetModelRequest { model_id: model_id.clone() };
+    let mut unread = raw(&server).await.get_model(request).await.expect("a model").into_inner();
+    timeout(SOON, learner.model(&model_id)).await.expect("its turn").expect("the model");
+    let status = loop {
+        match timeout(SOON, unread.message()).await.expect("an end") {
+            Ok(Some(_)) => {}
+            Ok(None) => panic!("it was cut off and says that it is whole"),
+            Err(status) => break status,
+        }
+    };
+    assert_eq!(status.code(), Code::DeadlineExceeded, "{status}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn models_that_wait_with_their_first_part_take_no_more_memory_than_that() {
+    let data = tempfile::tempdir().expect("a directory");
+    let server = LearnerServer::with(data.path(), Limits { max_concurrent_models: 1, ..Limits::default() });
+    let (first, under_way) = putting(&server, Some(everywhere(2, 1)[0].clone())).await;
+    sleep(Duration::from_millis(100)).await;
+    // Ten bytes each in millions: six fit into 64 MiB.
+    let mut waiting = Vec::new();
+    for _ in 0..9 {
+        let mut part = everywhere(2, 1)[0].clone();
+        header(std::slice::from_mut(&mut part)).env_id = "x".repeat(10_000_000);
+        waiting.push(putting(&server, Some(part)).await);
+    }
+    let refused = async {
+        while waiting.iter().filter(|(_, call)| call.is_finished()).count() < 3 {
+            sleep(Duration::from_millis(10)).await;
+        }
+    };
+    timeout(SOON, refused).await.expect("three answers");
+    drop(first);
+    under_way.await.expect("a task").expect_err("it has no rows");
+    let mut codes = Vec::new();
+    for (parts, call) in waiting {
+        drop(parts);
+        let status = timeout(SOON, call).await.expect("an answer").expect("a task").expect_err("refused");
+        let error = ClientError::from(status);
+        codes.push((error.code(), error.field().unwrap_or_default().to_owned()));
+    }
+    let full = codes.iter().filter(|(code, field)| *code == Code::ResourceExhausted && field == "part").count();
+    let wrong = codes.iter().filter(|(code, _)| *code == Code::InvalidArgument).count();
+    assert_eq!((full, wrong), (3, 6), "{codes:?}");
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -669,6 +788,148 @@ async fn callers_take_turns_at_fits_and_each_has_its_quota() {
         }
     }
     bob.fit(quick, |_| ()).await.expect("there is room again");
+}
+
+/// A learner whose numbers the test reads.
+struct Counted {
+    address: String,
+    numbers: Arc<Telemetry>,
+    task: JoinHandle<Result<(), ServeError>>,
+    stop: Arc<Notify>,
+}
+
+impl Counted {
+    async fn start(config: Config) -> Self {
+        let listener = Listener::bind(&"127.0.0.1:0".parse().expect("an address")).await.expect("a port");
+        let address = listener.address().expect("an address").to_string();
+        let (numbers, stop) = (Arc::new(mazeway_learner::telemetry()), Arc::new(Notify::new()));
+        let (counted, stopped) = (Arc::clone(&numbers), Arc::clone(&stop));
+        let task = tokio::spawn(async move {
+            mazeway_learner::serve_observed(config, listener, counted, async move { stopped.notified().await }).await
+        });
+        while !numbers.is_serving() {
+            assert!(!task.is_finished(), "it ends before it serves");
+            sleep(Duration::from_millis(5)).await;
+        }
+        Self { address, numbers, task, stop }
+    }
+
+    async fn known_by(&self, secret: &str) -> Learner {
+        let token = Some(Token::new(secret).expect("a token"));
+        let options = ConnectOptions { token, ..ConnectOptions::default() };
+        Learner::connect_with(&self.address, &options).await.expect("a learner that knows it")
+    }
+
+    fn number(&self, name: &str) -> f64 {
+        let text = self.numbers.text().expect("numbers");
+        let line =
+            text.lines().find_map(|line| line.strip_prefix("mazeway_learner_")?.strip_prefix(name)?.strip_prefix(' '));
+        line.unwrap_or_else(|| panic!("no {name} in\n{text}")).parse().expect("a number")
+    }
+
+    async fn becomes(&self, name: &str, number: f64) {
+        let begun = Instant::now();
+        while self.number(name) != number {
+            assert!(begun.elapsed() < SOON, "{name} is {} and not {number}", self.number(name));
+            sleep(Duration::from_millis(10)).await;
+        }
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_is_refused_is_counted_by_reason_and_what_waits_by_how_that_ends() {
+    let authority = Authority::new();
+    let scopes = [Scope::Record, Scope::Fit];
+    let alice = authority.token("alice", &scopes, &Quotas::default());
+    let bob = authority.token("bob", &scopes, &Quotas { max_fits: Some(1), ..Quotas::default() });
+    let carol = authority.token("carol", &scopes, &Quotas { max_recorded_bytes: Some(10), ..Quotas::default() });
+    let data = tempfile::tempdir().expect("a directory");
+    let limits =
+        Limits { max_concurrent_fits: 1, max_queued_fits: 2, max_trajectories_per_request: 50, ..Limits::default() };
+    let service = Counted::start(Config { door: authority.tokens(), limits, ..Config::new(data.path()) }).await;
+    for name in ["fits_refused_total{reason=\"share\"}", "fit_wait_seconds_count{outcome=\"stopped\"}"] {
+        assert_eq!(service.number(name), 0.0, "{name} is shown from the beginning");
+    }
+    let (alice, bob, carol) =
+        (service.known_by(&alice).await, service.known_by(&bob).await, service.known_by(&carol).await);
+    demonstrate(&alice).await;
+    let endless = endless(&alice).await;
+    let quick = pb::FitRequest {
+        method: "bc".into(),
+        filter: Some(pb::TrajectoryFilter { style: "goals".into(), ..Default::default() }),
+        ..Default::default()
+    };
+    alice.fit(quick.clone(), |_| ()).await.expect("a fit");
+    let mut running = alice.fit_stream(endless.clone()).await.expect("a stream");
+    timeout(PATIENCE, running.next()).await.expect("it runs").expect("progress");
+    let refused = async |by: &Learner, request: &pb::FitRequest, reason: &str| {
+        by.fit_stream(request.clone()).await.map(drop).expect_err(reason);
+        assert_eq!(service.number(&format!("fits_refused_total{{reason=\"{reason}\"}}")), 1.0, "{reason}");
+    };
+    refused(&alice, &pb::FitRequest { method: "magic".into(), ..quick.clone() }, "request").await;
+    let options = Some(pb::FitOptions { max_iterations: Some(u32::MAX), ..Default::default() });
+    refused(&alice, &pb::FitRequest { options, ..quick.clone() }, "limit").await;
+    let waiting = alice.fit_stream(quick.clone()).await.expect("a place");
+    refused(&alice, &quick, "share").await;
+    let mut of_bob = bob.fit_stream(quick.clone()).await.expect("a place");
+    refused(&bob, &quick, "quota").await;
+    refused(&carol, &quick, "queue_full").await;
+    drop(waiting);
+    service.becomes("fit_wait_seconds_count{outcome=\"cancelled\"}", 1.0).await;
+    drop(running);
+    while !matches!(timeout(PATIENCE, of_bob.next()).await.expect("a turn").expect("a fit"), Some(Event::Fit(_))) {}
+    service.becomes("fit_seconds_count{method=\"em-tied\",outcome=\"cancelled\"}", 1.0).await;
+    assert_eq!(service.number("fit_seconds_count{method=\"bc\",outcome=\"fitted\"}"), 2.0);
+    assert_eq!(service.number("fit_wait_seconds_count{outcome=\"begun\"}"), 3.0);
+    assert!(service.number("fit_wait_seconds_sum{outcome=\"begun\"}") > 0.0);
+
+    let recorded = async |by: &Learner, all: Vec<pb::Trajectory>| {
+        let mut recorder = by.recorder();
+        for trajectory in all {
+            recorder.record(trajectory).await?;
+        }
+        recorder.finish().await
+    };
+    recorded(&alice, vec![trajectory(1)]).await.expect("stored");
+    recorded(&carol, vec![trajectory(2)]).await.expect_err("more than it may");
+    let other = pb::Trajectory { source: "other".into(), ..trajectory(1) };
+    recorded(&alice, vec![other]).await.expect_err("another content");
+    recorded(&alice, vec![pb::Trajectory { style: "x".repeat(201), ..trajectory(3) }]).await.expect_err("too long");
+    for reason in ["quota", "exists", "request"] {
+        assert!(service.number(&format!("recordings_refused_total{{reason=\"{reason}\"}}")) >= 1.0, "{reason}");
+    }
+    assert_eq!(service.number("recordings_refused_total{reason=\"store_full\"}"), 0.0);
+    // Told while it waits that the service stops.
+    let mut running = alice.fit_stream(endless.clone()).await.expect("a stream");
+    timeout(PATIENCE, running.next()).await.expect("it runs").expect("progress");
+    let _waiting = alice.fit_stream(quick).await.expect("a place");
+    service.stop.notify_one();
+    service.becomes("fit_wait_seconds_count{outcome=\"stopped\"}", 1.0).await;
+    drop(running);
+    timeout(PATIENCE, service.task).await.expect("an end").expect("a task").expect("it ends well");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_full_store_tells_its_limit_and_not_what_others_keep_in_it() {
+    let data = tempfile::tempdir().expect("a directory");
+    let limits = Limits { max_store_bytes: Some(1), ..Limits::default() };
+    let service = Counted::start(Config { limits, ..Config::new(data.path()) }).await;
+    let learner = Learner::connect(&service.address).await.expect("connects");
+    let mut recorder = learner.recorder();
+    let recorded = match recorder.record(trajectory(1)).await {
+        Ok(()) => recorder.finish().await.map(drop),
+        Err(error) => Err(error),
+    };
+    let put = learner.put_model_parts(everywhere(2, 1)).await.map(drop);
+    for (error, number) in [
+        (recorded.expect_err("no room"), "recordings_refused_total{reason=\"store_full\"}"),
+        (put.expect_err("no room"), "models_refused_total{reason=\"store_full\"}"),
+    ] {
+        assert_eq!(blame(&error), (Code::ResourceExhausted, "max_store_bytes".into()));
+        let numbers = error.to_string().split(|c: char| !c.is_ascii_digit()).filter(|n| !n.is_empty()).count();
+        assert!(error.to_string().contains("may hold 1 bytes") && numbers == 1, "{error}");
+        assert!(service.number(number) >= 1.0, "{number}");
+    }
 }
 
 #[tokio::test(flavor = "multi_thread")]

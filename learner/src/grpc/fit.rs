@@ -1,13 +1,14 @@
 //! The stream of a fit: waits its turn, runs on a thread for fits, tells of its place and its progress, stores the result.
 //!
 //! Invariants: turns go round between callers (see `turns`); progress is dropped rather than waited for, so a slow reader
-//! never slows a fit; a fit whose caller has gone leaves the queue at once, or stops at its next iteration, and is not stored.
+//! never slows a fit; a fit whose caller has gone leaves the queue at once, or stops at its next iteration, and is not stored;
+//! whoever waits for one is told when the service stops, whatever the fit is at.
 
 mod numbers;
 mod pool;
 mod turns;
 
-use super::{fit_job::FitJob, fit_job::progress_message, status::CallError};
+use super::{fit_job::FitJob, fit_job::progress_message, models::unless, status::CallError};
 use crate::{
     config::Limits,
     irl::TraceEntry,
@@ -15,12 +16,15 @@ use crate::{
 };
 use mazeway_proto::learner::{self as pb, fit_response::Event};
 use mazeway_serving::{Caller, telemetry::Telemetry};
-use numbers::Fits;
+use numbers::{BEGUN, CANCELLED, Fits, STOPPED};
 use pool::{Place, Pool, Stand};
 use std::{
     io,
     ops::ControlFlow,
-    sync::Arc,
+    sync::{
+        Arc,
+        atomic::{AtomicBool, Ordering::Relaxed},
+    },
     time::{Duration, Instant},
 };
 use tokio::sync::{mpsc, oneshot};
@@ -73,6 +77,11 @@ impl FitQueue {
         Ok(Self { pool, fits: Fits::new(telemetry), stopping, aborting })
     }
 
+    /// Takes note of one that is refused for what it asks.
+    pub fn refuses(&self, error: &CallError) {
+        self.fits.refuses(error);
+    }
+
     /// Takes a place in the queue, or refuses, and returns the stream that will tell how it goes. `quota` is how many fits
     /// the caller may have, those that wait and those that run.
     pub fn submit(
@@ -88,23 +97,40 @@ impl FitQueue {
             let (events, aborting) = (events.clone(), self.aborting.clone());
             move || events.is_closed() || aborting.is_cancelled()
         };
+        let queued = Arc::new(AtomicBool::new(false));
         let work = {
-            let (events, store, fits) = (events.clone(), store.clone(), self.fits.clone());
+            let (events, store, fits, aborting) =
+                (events.clone(), store.clone(), self.fits.clone(), self.aborting.clone());
+            let wait = Wait {
+                fits: fits.clone(),
+                since: Instant::now(),
+                queued: Arc::clone(&queued),
+                is_over: false,
+                stopping: self.stopping.clone(),
+            };
             move || {
+                wait.end();
                 let (method, begun) = (job.method_id(), Instant::now());
-                let outcome = run(job, &store, &events, cancelled);
+                let outcome = run(job, &store, &events, cancelled).map_err(|error| match error {
+                    CallError::Cancelled if aborting.is_cancelled() => CallError::ShuttingDown,
+                    error => error,
+                });
                 fits.ended(method, &outcome, begun.elapsed());
                 // A caller that has gone wants nothing.
                 let _ = done.send(outcome);
             }
         };
-        let mut place = self.pool.submit(caller, quota, Box::new(work)).map_err(no_place)?;
-        let stopping = self.stopping.clone();
+        let place = self.pool.submit(caller, quota, Box::new(work));
+        let mut place = place.inspect_err(|full| self.fits.finds_no_place(*full)).map_err(no_place)?;
+        queued.store(true, Relaxed);
+        let (stopping, aborting) = (self.stopping.clone(), self.aborting.clone());
         tokio::spawn(async move {
             let last = match wait(&mut place, &events, &stopping).await {
-                Ok(()) => match outcome.await {
-                    Ok(fit) => keep(fit, &store).await,
-                    Err(_) => Err(CallError::Internal("the fit panicked".into())),
+                // Its thread may be long in coming to its next iteration.
+                Ok(()) => match unless(&aborting, outcome).await {
+                    Ok(Ok(fit)) => keep(fit, &store).await,
+                    Ok(Err(_)) => Err(CallError::Internal("the fit panicked".into())),
+                    Err(stopped) => Err(stopped),
                 },
                 Err(error) => Err(error),
             };
@@ -113,6 +139,34 @@ impl FitQueue {
             let _ = events.send(last.map(|fit| response(Event::Fit(fit))).map_err(Status::from)).await;
         });
         Ok(stream)
+    }
+}
+
+/// A fit in the queue. Dropped before its turn, its caller has gone or the service stops.
+struct Wait {
+    fits: Fits,
+    since: Instant,
+    /// False where it did not come to wait.
+    queued: Arc<AtomicBool>,
+    /// True once its turn has come.
+    is_over: bool,
+    stopping: CancellationToken,
+}
+
+impl Wait {
+    /// Its turn has come.
+    fn end(mut self) {
+        self.is_over = true;
+        self.fits.waited(BEGUN, self.since.elapsed());
+    }
+}
+
+impl Drop for Wait {
+    fn drop(&mut self) {
+        if !self.is_over && self.queued.load(Relaxed) {
+            let outcome = if self.stopping.is_cancelled() { STOPPED } else { CANCELLED };
+            self.fits.waited(outcome, self.since.elapsed());
+        }
     }
 }
 

@@ -1,10 +1,13 @@
 //! The stream that records: requests go to the store in the order in which they came, answers come back in that order,
 //! each once its trajectories are on stable storage. Reading goes on while the disk works, up to a limit.
+//!
+//! A recorder may be silent for as long as it likes: between two requests its stream holds neither memory nor a place that
+//! others wait for.
 
-use super::{blocking, from_proto, status::CallError};
+use super::{blocking, from_proto, numbers::Refusals, status::CallError};
 use crate::{
     config::Limits,
-    store::{Allowance, Pending, Recording, Store},
+    store::{self, Allowance, Pending, Store},
 };
 use futures_util::{Stream, StreamExt as _};
 use mazeway_proto::learner as pb;
@@ -23,14 +26,26 @@ struct Queued {
     stored: Pending<u32>,
 }
 
+/// What a recording stream works with.
+pub struct Recording {
+    /// Where it records.
+    pub store: Store,
+    /// At whose expense.
+    pub allowance: Option<Allowance>,
+    /// What it refuses.
+    pub limits: Arc<Limits>,
+    /// Where that is counted.
+    pub refused: Refusals,
+    /// Cancelled when it is to end.
+    pub stopping: CancellationToken,
+}
+
 /// Reads requests until the caller has no more, errs or goes, or the service stops.
 pub fn record(
-    store: Store,
-    allowance: Option<Allowance>,
-    limits: Arc<Limits>,
+    recording: Recording,
     mut requests: Streaming<pb::RecordTrajectoriesRequest>,
-    stopping: CancellationToken,
 ) -> impl Stream<Item = Result<pb::RecordTrajectoriesResponse, Status>> {
+    let Recording { store, allowance, limits, refused, stopping } = recording;
     let (queue, queued) = mpsc::channel::<Result<Queued, CallError>>(limits.max_requests_in_flight.max(1));
     tokio::spawn(async move {
         loop {
@@ -53,11 +68,20 @@ pub fn record(
             }
         }
     });
-    ReceiverStream::new(queued).then(|queued| async move {
-        let Queued { trajectory_ids, stored } = queued?;
-        let stored = stored.committed().await.map_err(CallError::from)?;
-        Ok(pb::RecordTrajectoriesResponse { trajectory_ids, stored })
+    ReceiverStream::new(queued).then(move |queued| {
+        let refused = refused.clone();
+        async move {
+            let answer = answer(queued).await;
+            answer.inspect_err(|error| refused.count(error)).map_err(Status::from)
+        }
     })
+}
+
+/// The answer to a request, once its trajectories are on stable storage.
+async fn answer(queued: Result<Queued, CallError>) -> Result<pb::RecordTrajectoriesResponse, CallError> {
+    let Queued { trajectory_ids, stored } = queued?;
+    let stored = stored.committed().await?;
+    Ok(pb::RecordTrajectoriesResponse { trajectory_ids, stored })
 }
 
 async fn enqueue(
@@ -67,7 +91,7 @@ async fn enqueue(
     request: pb::RecordTrajectoriesRequest,
 ) -> Result<Queued, CallError> {
     let bytes = request.trajectories.iter().map(|t| t.states.len() + t.actions.len() + t.rewards.len()).sum::<usize>();
-    let recordings: Vec<Recording> = if bytes < LARGE_BYTES {
+    let recordings: Vec<store::Recording> = if bytes < LARGE_BYTES {
         from_proto::recordings(request, limits)?
     } else {
         let limits = Arc::clone(limits);

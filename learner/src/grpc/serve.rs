@@ -14,7 +14,7 @@ use mazeway_serving::{
     transport::{Transport, Wire},
 };
 use std::{future::Future, sync::Arc, time::Duration};
-use tokio::task::spawn_blocking;
+use tokio::{task::spawn_blocking, time::timeout};
 use tokio_util::{sync::CancellationToken, task::TaskTracker};
 use tonic::service::Routes;
 use tonic_health::{ServingStatus, server::HealthReporter};
@@ -23,6 +23,10 @@ use tonic_health::{ServingStatus, server::HealthReporter};
 const WINDOW_BYTES: u32 = 4 << 20;
 /// Largest frame taken in.
 const FRAME_BYTES: u32 = 64 << 10;
+
+/// Time before the end of the grace in which whoever is still inside is told that the service stops, a quarter of the grace
+/// at most.
+const LAST_WORDS: Duration = Duration::from_secs(1);
 
 /// What health calls the taking of recordings, which needs room on the disk; all else goes on without.
 const RECORDING: &str = "mazeway.learner.v1.LearnerService/RecordTrajectories";
@@ -47,8 +51,9 @@ pub enum ServeError {
 }
 
 /// Opens the store and serves the learner, health and reflection on `listener` until `shutdown` is ready. Recording
-/// streams then answer what they have read and end, running fits and calls have [`Limits::shutdown_grace`] to end, and
-/// everything that was accepted is on stable storage when this returns.
+/// streams then answer what they have read and end, running fits and calls have [`Limits::shutdown_grace`] to end and are told
+/// shortly before it is over, and everything that was accepted is on stable storage when this returns. `shutdown` is first
+/// polled when everything has started.
 ///
 /// [`Limits::shutdown_grace`]: crate::config::Limits::shutdown_grace
 ///
@@ -112,8 +117,8 @@ async fn serve_store(
     };
     let max_message_bytes = limits.max_message_bytes;
     // What is sent is bounded by what was accepted: a fit's arrays by its model, a page of trajectories by its size.
-    let learner =
-        LearnerGrpc::new(store.clone(), limits, telemetry, stopping.clone(), aborting).map_err(ServeError::Threads)?;
+    let learner = LearnerGrpc::new(store.clone(), limits, telemetry, stopping.clone(), aborting.clone())
+        .map_err(ServeError::Threads)?;
     let learner = LearnerServiceServer::new(learner).max_decoding_message_size(max_message_bytes);
     let (health, health_service) = tonic_health::server::health_reporter();
     health.set_serving::<LearnerServiceServer<LearnerGrpc>>().await;
@@ -153,7 +158,10 @@ async fn serve_store(
     drop(gate);
     stopping.cancel();
     connections.close();
-    connections.wait().await;
+    if timeout(grace.saturating_sub(LAST_WORDS.min(grace / 4)), connections.wait()).await.is_err() {
+        aborting.cancel();
+        connections.wait().await;
+    }
     Ok(())
 }
 

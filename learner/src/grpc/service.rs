@@ -5,8 +5,9 @@ use super::{
     fit::{FitQueue, Response as FitEvent},
     fit_job::FitJob,
     from_proto,
-    models::ModelBuilder,
-    record,
+    models::{Models, unless},
+    numbers::Refusals,
+    record::{self, Recording},
     status::CallError,
     to_proto,
 };
@@ -18,7 +19,7 @@ use futures_util::Stream;
 use mazeway_proto::learner::{self as pb, learner_service_server::LearnerService};
 use mazeway_serving::{Caller, telemetry::Telemetry};
 use std::{io, pin::Pin, sync::Arc};
-use tokio::sync::{Semaphore, mpsc};
+use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::sync::CancellationToken;
 use tonic::{Request, Response, Status, Streaming};
@@ -31,8 +32,6 @@ const MAX_TRAJECTORY_PAGE: u32 = 10_000;
 const MAX_FIT_PAGE: u32 = 1_000;
 /// Pages of an export that wait for the reader.
 const EXPORT_QUEUE: usize = 2;
-/// Models that are taken in or given out at a time; further ones wait.
-const CONCURRENT_MODELS: usize = 2;
 
 type BoxStream<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
 
@@ -41,12 +40,16 @@ pub struct LearnerGrpc {
     store: Store,
     limits: Arc<Limits>,
     fits: FitQueue,
-    models: Arc<Semaphore>,
+    models: Models,
+    recordings_refused: Refusals,
+    models_refused: Refusals,
     stopping: CancellationToken,
+    aborting: CancellationToken,
 }
 
 impl LearnerGrpc {
-    /// `stopping` ends recording streams and keeps further fits from beginning; `aborting` ends running fits.
+    /// `stopping` ends recording streams and keeps further fits from beginning; `aborting` ends running fits and all other
+    /// streams.
     ///
     /// # Errors
     /// There are no threads for fits.
@@ -57,9 +60,11 @@ impl LearnerGrpc {
         stopping: CancellationToken,
         aborting: CancellationToken,
     ) -> io::Result<Self> {
-        let fits = FitQueue::new(&limits, telemetry, stopping.clone(), aborting)?;
-        let models = Arc::new(Semaphore::new(CONCURRENT_MODELS));
-        Ok(Self { store, limits: Arc::new(limits), fits, models, stopping })
+        let fits = FitQueue::new(&limits, telemetry, stopping.clone(), aborting.clone())?;
+        let limits = Arc::new(limits);
+        let models = Models::new(&limits, stopping.clone(), aborting.clone());
+        let (recordings_refused, models_refused) = (Refusals::of_recordings(telemetry), Refusals::of_models(telemetry));
+        Ok(Self { store, limits, fits, models, recordings_refused, models_refused, stopping, aborting })
     }
 
     /// Reads the store off the async threads.
@@ -89,10 +94,14 @@ impl LearnerService for LearnerGrpc {
         &self,
         request: Request<Streaming<pb::RecordTrajectoriesRequest>>,
     ) -> Result<Response<Self::RecordTrajectoriesStream>, Status> {
-        let (store, limits) = (self.store.clone(), Arc::clone(&self.limits));
-        let allowance = allowance(&Caller::of(&request));
-        let stream = record::record(store, allowance, limits, request.into_inner(), self.stopping.clone());
-        Ok(Response::new(Box::pin(stream)))
+        let recording = Recording {
+            store: self.store.clone(),
+            allowance: allowance(&Caller::of(&request)),
+            limits: Arc::clone(&self.limits),
+            refused: self.recordings_refused.clone(),
+            stopping: self.stopping.clone(),
+        };
+        Ok(Response::new(Box::pin(record::record(recording, request.into_inner()))))
     }
 
     async fn put_model(
@@ -100,38 +109,24 @@ impl LearnerService for LearnerGrpc {
         request: Request<Streaming<pb::PutModelRequest>>,
     ) -> Result<Response<pb::PutModelResponse>, Status> {
         let allowance = allowance(&Caller::of(&request));
-        let _permit = self.models.acquire().await.map_err(|_| CallError::ShuttingDown)?;
-        let mut parts = request.into_inner();
-        let mut builder = ModelBuilder::default();
-        let mut replace = None;
-        while let Some(request) = parts.message().await.map_err(CallError::from)? {
-            replace.get_or_insert(request.replace);
-            builder.add(request.part, &self.limits)?;
-        }
-        let model = blocking(move || builder.finish()).await?;
-        let model_id = model.model_id().to_owned();
-        let put = self.store.put_model_of(allowance, model, replace.unwrap_or(false)).await.map_err(CallError::from)?;
-        Ok(Response::new(pb::PutModelResponse { model_id, already_stored: put == Put::Known }))
+        let putting = async {
+            let (model, replace, _turn) = self.models.receive(request.into_inner()).await?;
+            let model_id = model.model_id().to_owned();
+            let put = self.store.put_model_of(allowance, model, replace).await?;
+            Ok(pb::PutModelResponse { model_id, already_stored: put == Put::Known })
+        };
+        let put: Result<_, CallError> = putting.await;
+        Ok(Response::new(put.inspect_err(|error| self.models_refused.count(error))?))
     }
 
     async fn get_model(&self, request: Request<pb::GetModelRequest>) -> Result<Response<Self::GetModelStream>, Status> {
-        let permit = Arc::clone(&self.models).acquire_owned().await.map_err(|_| CallError::ShuttingDown)?;
         let id = request.into_inner().model_id;
         check_model_id("model_id", &id).map_err(CallError::from)?;
+        let turn = self.models.turn().await?;
         let model = self
             .read(move |store| store.model(&id)?.ok_or(CallError::NotFound { field: "model_id", what: "model", id }))
             .await?;
-        let (parts, stream) = mpsc::channel(EXPORT_QUEUE);
-        tokio::spawn(async move {
-            // As many models are in memory at a time as there are permits.
-            let _permit = permit;
-            for part in to_proto::model_parts(&model) {
-                if parts.send(Ok(part)).await.is_err() {
-                    return;
-                }
-            }
-        });
-        Ok(Response::new(ReceiverStream::new(stream)))
+        Ok(Response::new(ReceiverStream::new(self.models.send(model, turn))))
     }
 
     async fn list_models(
@@ -196,21 +191,25 @@ impl LearnerService for LearnerGrpc {
             })
             .await?;
         let (pages, stream) = mpsc::channel(EXPORT_QUEUE);
-        let store = self.store.clone();
+        let (store, aborting) = (self.store.clone(), self.aborting.clone());
         tokio::spawn(async move {
-            // A place for a page first: a reader that is slow keeps neither a thread nor a page.
-            while let Ok(place) = pages.reserve().await {
-                let reader = store.clone();
-                let page = blocking(move || Ok((reader.next_page(&mut cursor)?, cursor))).await;
-                match page {
-                    Ok((page, _)) if page.is_empty() => return,
-                    Ok((page, rest)) => {
-                        cursor = rest;
-                        let trajectories = page.into_iter().map(to_proto::trajectory).collect();
-                        place.send(Ok(pb::ExportTrajectoriesResponse { trajectories }));
+            let exporting = async {
+                // A place for a page first: a reader that is slow keeps neither a thread nor a page.
+                while let Ok(place) = pages.reserve().await {
+                    let reader = store.clone();
+                    let (page, rest) = blocking(move || Ok((reader.next_page(&mut cursor)?, cursor))).await?;
+                    if page.is_empty() {
+                        break;
                     }
-                    Err(error) => return place.send(Err(error.into())),
+                    cursor = rest;
+                    let trajectories = page.into_iter().map(pb::Trajectory::from).collect();
+                    place.send(Ok(pb::ExportTrajectoriesResponse { trajectories }));
                 }
+                Ok(())
+            };
+            if let Err(error) = unless(&aborting, exporting).await.flatten() {
+                // A caller that has gone reads no more.
+                let _ = pages.send(Err(error.into())).await;
             }
         });
         Ok(Response::new(ReceiverStream::new(stream)))
@@ -218,7 +217,7 @@ impl LearnerService for LearnerGrpc {
 
     async fn fit(&self, request: Request<pb::FitRequest>) -> Result<Response<Self::FitStream>, Status> {
         let caller = Caller::of(&request);
-        let job = FitJob::new(request.into_inner(), &self.limits)?;
+        let job = FitJob::new(request.into_inner(), &self.limits).inspect_err(|error| self.fits.refuses(error))?;
         let stream = self.fits.submit(&caller, caller.quotas().max_fits, job, self.store.clone())?;
         Ok(Response::new(ReceiverStream::new(stream)))
     }

@@ -2,6 +2,7 @@
 
 use crate::store::{FieldError, StoreError};
 use mazeway_serving::incident;
+use std::time::Duration;
 use tonic::{Code, Status};
 use tonic_types::{ErrorDetails, StatusExt as _};
 
@@ -45,6 +46,22 @@ pub enum CallError {
         limit: u64,
         /// What came.
         got: u64,
+    },
+    /// All callers together have as much under way as the service takes.
+    #[error("{field}: there is no room for more {what} than {limit} of all callers together; try again later")]
+    Full {
+        /// Field that there is no room for.
+        field: &'static str,
+        /// Of what.
+        what: &'static str,
+        /// How much there is room for.
+        limit: u64,
+    },
+    /// The other end of a model's stream sent or read too little in too long.
+    #[error("expected the other end of the model's stream to go on within {}, it did not", humantime::format_duration(*.patience))]
+    Slow {
+        /// How long it was waited for.
+        patience: Duration,
     },
     /// The caller went.
     #[error("the caller went before the fit was done")]
@@ -98,6 +115,11 @@ impl From<CallError> for Status {
                 details.add_quota_failure_violation(field.as_str(), message.as_str());
                 Code::ResourceExhausted
             }
+            CallError::Full { field, .. } => {
+                details.add_quota_failure_violation(*field, message.as_str());
+                Code::ResourceExhausted
+            }
+            CallError::Slow { .. } => Code::DeadlineExceeded,
             CallError::Store(error) => store_code(error, &message, &mut details),
             CallError::Cancelled => Code::Cancelled,
             CallError::ShuttingDown => Code::Unavailable,
@@ -121,6 +143,12 @@ fn told(error: &CallError) -> String {
             | StoreError::Database { .. },
         ) => "the store failed",
         CallError::Internal(_) => "internal error",
+        // What the store holds is of all callers: none is told how much the others have.
+        CallError::Store(StoreError::QuotaReached { limit, .. }) => {
+            return format!(
+                "the store has no room for this: it may hold {limit} bytes; delete recordings, or raise the limit"
+            );
+        }
         CallError::Store(StoreError::Corrupt { .. }) => {
             tracing::error!(%error, "a call failed through no fault of its caller");
             return error.to_string();
@@ -191,5 +219,13 @@ mod tests {
             let details = String::from_utf8_lossy(status.details()).into_owned();
             assert!(!details.contains("secret"), "{details}");
         }
+    }
+    #[test]
+    fn a_caller_learns_a_limit_and_not_what_others_have_of_it() {
+        let status = Status::from(CallError::from(StoreError::QuotaReached { limit: 1000, used: 777 }));
+        assert_eq!(status.code(), Code::ResourceExhausted);
+        let details = String::from_utf8_lossy(status.details()).into_owned();
+        assert!(status.message().contains("1000") && details.contains("1000"), "{status}");
+        assert!(!status.message().contains("777") && !details.contains("777"), "{status}");
     }
 }

@@ -1,6 +1,7 @@
 //! From what the learner works with to messages.
 
-use crate::store::{FitInfo, Model, ModelInfo, Recording, TrajectorySummary, timestamp, unpack_u32};
+use crate::store::{FitInfo, Model, ModelInfo, TrajectorySummary, timestamp, unpack_u32};
+use bytes::Bytes;
 use mazeway_proto::{
     env::{ModelPart, RowBlock, model_part::Part},
     learner as pb,
@@ -11,7 +12,8 @@ const ROWS_A_BLOCK: usize = 4096;
 /// Entries after which a message ends.
 const ENTRIES_A_BLOCK: usize = 1 << 15;
 
-/// A model as it travels: a header, then blocks of rows, cut from the packed arrays without a copy.
+/// A model as it travels: a header, then blocks of rows. They are copies, so that a part that waits for its reader keeps no
+/// more than itself in memory.
 pub fn model_parts(model: &Model) -> impl Iterator<Item = pb::GetModelResponse> + '_ {
     let rows = model.rows();
     let lengths: Vec<u32> = unpack_u32(&rows.row_lengths).collect();
@@ -26,40 +28,20 @@ pub fn model_parts(model: &Model) -> impl Iterator<Item = pb::GetModelResponse> 
             (row, entry) = (row + 1, end);
         }
         (row > first_row).then(|| {
+            let cut = |array: &Bytes, from: usize, to: usize| Bytes::copy_from_slice(&array[from..to]);
             let counts = &rows.visit_counts;
             Part::Rows(RowBlock {
                 first_row: first_row as u32,
-                row_lengths: rows.row_lengths.slice(first_row * 4..row * 4),
-                next_states: rows.next_states.slice(first_entry * 4..entry * 4),
-                probabilities: rows.probabilities.slice(first_entry * 8..entry * 8),
-                visit_counts: if counts.is_empty() { counts.clone() } else { counts.slice(first_row * 8..row * 8) },
+                row_lengths: cut(&rows.row_lengths, first_row * 4, row * 4),
+                next_states: cut(&rows.next_states, first_entry * 4, entry * 4),
+                probabilities: cut(&rows.probabilities, first_entry * 8, entry * 8),
+                visit_counts: if counts.is_empty() { counts.clone() } else { cut(counts, first_row * 8, row * 8) },
             })
         })
     });
     std::iter::once(Part::Header(model.header().clone()))
         .chain(blocks)
         .map(|part| pb::GetModelResponse { part: Some(ModelPart { part: Some(part) }) })
-}
-
-/// A whole trajectory.
-pub fn trajectory(recording: Recording) -> pb::Trajectory {
-    let (id, collection, seed, arrays) = recording.into_parts();
-    pb::Trajectory {
-        trajectory_id: id.to_string(),
-        env_id: collection.env_id,
-        model_id: collection.model_id,
-        style: collection.style,
-        source: collection.source,
-        seed,
-        n_states: collection.n_states,
-        n_actions: collection.n_actions,
-        states: arrays.states,
-        actions: arrays.actions,
-        rewards: arrays.rewards,
-        final_state: arrays.final_state,
-        terminated: arrays.terminated,
-        truncated: arrays.truncated,
-    }
 }
 
 /// A trajectory without its arrays.

@@ -74,6 +74,15 @@ impl Shown {
         line.unwrap_or_else(|| panic!("no {name} in\n{text}")).parse().expect("a number")
     }
 
+    /// Waits for a number that may be a moment behind the answer that told of it.
+    fn reaches(&self, name: &str, number: f64) {
+        let begun = Instant::now();
+        while self.number(name) != number {
+            assert!(begun.elapsed() < Duration::from_secs(10), "{name} is {}, not {number}", self.number(name));
+            std::thread::sleep(Duration::from_millis(20));
+        }
+    }
+
     /// Tells it to stop, and gives its log.
     fn stop(mut self) -> String {
         let status = Command::new("kill").args(["-TERM", &self.child.id().to_string()]).status().expect("kill");
@@ -302,7 +311,7 @@ async fn a_learner_counts_what_it_stores_and_fits() {
         ("mazeway_learner_commit_failures_total", 0.0),
         ("mazeway_learner_writable", 1.0),
     ] {
-        assert_eq!(service.number(name), number, "{name}");
+        service.reaches(name, number);
     }
     assert!(service.number("mazeway_learner_commit_seconds_count") >= 2.0);
     assert!(service.number("mazeway_learner_store_bytes") > bytes as f64);

@@ -14,14 +14,19 @@ use std::{
     time::Duration,
 };
 use tokio::{
-    sync::{Mutex, OnceCell, mpsc},
+    sync::{
+        Mutex, OnceCell,
+        mpsc::{self, error::TrySendError},
+    },
     task::JoinHandle,
 };
-use tokio_stream::wrappers::UnboundedReceiverStream;
+use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Request, Status, Streaming, client::Grpc, codegen::http::uri::PathAndQuery};
 
 /// Largest message either way.
 const MAX_MESSAGE_BYTES: usize = 256 << 20;
+/// Requests of a stream that may wait to be sent. Python's own bounds are far below, so that this is a defect's end.
+const MAX_WAITING: usize = 4096;
 
 /// A connection and who drives it.
 #[derive(Debug)]
@@ -150,10 +155,10 @@ impl Channel {
     /// A stream both ways.
     fn exchange(&self, path: &str) -> PyResult<Exchange> {
         let (link, path) = (self.link()?, self::path(path)?);
-        let (requests, body) = mpsc::unbounded_channel();
+        let (requests, body) = mpsc::channel(MAX_WAITING);
         let dial = Arc::clone(&link.dial);
         let call = link.driver.runtime().spawn(async move {
-            let body = UnboundedReceiverStream::new(body);
+            let body = ReceiverStream::new(body);
             let answer = dial.grpc().await?.streaming(Request::new(body), path, Raw).await;
             Ok::<_, Failure>(answer?.into_inner())
         });
@@ -242,7 +247,7 @@ impl Answers {
 }
 
 /// Requests that wait to be sent; none where the stream is over.
-type Outgoing = Lock<Option<mpsc::UnboundedSender<Bytes>>>;
+type Outgoing = Lock<Option<mpsc::Sender<Bytes>>>;
 
 /// A stream both ways, whose n-th answer is to the n-th request.
 #[pyclass(frozen, module = "mazeway._native")]
@@ -251,13 +256,24 @@ pub struct Exchange(Local<(Outgoing, Incoming)>);
 
 #[pymethods]
 impl Exchange {
-    /// Sends a request; never waits.
+    /// Sends a request; never waits. Refused where too many wait to be sent.
     fn send(&self, py: Python<'_>, request: &[u8]) -> PyResult<()> {
         let (requests, incoming) = self.0.get()?;
         if let Some(requests) = &*requests.lock().unwrap_or_else(PoisonError::into_inner) {
-            // A stream that has ended says why with its next answer.
-            let _ = requests.send(Bytes::copy_from_slice(request));
+            match requests.try_send(Bytes::copy_from_slice(request)) {
+                // A stream that has ended says why with its next answer.
+                Ok(()) | Err(TrySendError::Closed(_)) => {}
+                Err(TrySendError::Full(_)) => return Err(Failure::full(MAX_WAITING).into()),
+            }
         }
+        incoming.link.driver.settle(py);
+        Ok(())
+    }
+
+    /// Sends no more: the other side ends the stream when it has answered all.
+    fn end(&self, py: Python<'_>) -> PyResult<()> {
+        let (requests, incoming) = self.0.get()?;
+        requests.lock().unwrap_or_else(PoisonError::into_inner).take();
         incoming.link.driver.settle(py);
         Ok(())
     }

@@ -35,6 +35,12 @@ impl Failure {
         Self { code: Code::Internal, message: message.into(), violations: Vec::new() }
     }
 
+    /// More than may wait to be sent.
+    pub fn full(most: usize) -> Self {
+        let message = format!("expected at most {most} requests that wait to be sent");
+        Self { code: Code::ResourceExhausted, message, violations: Vec::new() }
+    }
+
     /// A wrong argument.
     pub fn argument(field: &str, message: String) -> Self {
         Self { code: Code::InvalidArgument, violations: vec![(field.into(), message.clone())], message }

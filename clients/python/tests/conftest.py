@@ -9,6 +9,7 @@ import socket
 import subprocess
 import threading
 import time
+import urllib.request
 from pathlib import Path
 
 import pytest
@@ -35,24 +36,32 @@ class Process:
         self.log = log
         with log.open("ab") as stderr:
             self.popen = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=stderr, bufsize=0)
-        self.address = self._read_address()
+        self._said = b""
+        self.address = self._read(rb"listening on (?:http://)?(unix:\S+|\S+:\d+)\s")
 
-    def _read_address(self):
-        selector = selectors.DefaultSelector()
-        selector.register(self.popen.stdout, selectors.EVENT_READ)
-        seen = b""
+    def _read(self, pattern):
+        """What the pattern's group matches in what the process has said so far, or says next."""
         deadline = time.monotonic() + 60
-        while time.monotonic() < deadline:
-            if selector.select(timeout=1):
-                chunk = os.read(self.popen.stdout.fileno(), 4096)
-                seen += chunk
-                if found := re.search(rb"listening on (?:http://)?(unix:\S+|\S+:\d+)\s", seen):
-                    selector.close()
+        with selectors.DefaultSelector() as selector:
+            selector.register(self.popen.stdout, selectors.EVENT_READ)
+            while time.monotonic() < deadline:
+                if found := re.search(pattern, self._said):
                     return found[1].decode()
-                if not chunk:
-                    break
+                if selector.select(timeout=1):
+                    chunk = os.read(self.popen.stdout.fileno(), 4096)
+                    self._said += chunk
+                    if not chunk:
+                        break
         self.stop()
-        pytest.fail(f"no address line; stdout: {seen!r}, stderr: {self.log.read_text()}")
+        pytest.fail(f"no such line; stdout: {self._said!r}, stderr: {self.log.read_text()}")
+
+    def calls(self):
+        """How many calls have ended, by method and code; needs `--metrics-listen`."""
+        url = self._read(rb"metrics on (http://\S+)\s")
+        with urllib.request.urlopen(url, timeout=30) as answer:
+            text = answer.read().decode()
+        counted = re.findall(r'_calls_total\{method="\S+/(\w+)",code="(\w+)"\} (\d+)', text)
+        return {(method, code): int(calls) for method, code, calls in counted if int(calls)}
 
     def pause(self):
         """Stops the process in its tracks and waits until it stands still."""

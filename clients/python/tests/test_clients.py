@@ -1,5 +1,6 @@
 """The two clients are one to their users: the same numbers, types and errors, call by call."""
 
+import socket
 import subprocess
 import sys
 import threading
@@ -13,7 +14,8 @@ from test_env import ENVIRONMENTS, OPTIONS, drive
 from test_vector import MODES, assert_same
 
 import mazeway
-from mazeway import _transport
+from mazeway import _transport, _wire
+from mazeway._access import Access
 
 CLIENTS = ["native", "grpc"]
 
@@ -283,3 +285,17 @@ def test_a_silent_client_goes_on(tmp_path):
             env.close()
     finally:
         process.stop()
+
+
+def test_what_waits_to_be_sent_is_bounded():
+    with socket.create_server(("127.0.0.1", 0)) as listener:  # takes connections and never says a word
+        address = f"127.0.0.1:{listener.getsockname()[1]}"
+        transport = _transport.connect(address, _wire.ENVIRONMENT_SERVICE, Access("native"))
+        exchange = transport.exchange("Interact", timeout=1)
+        request = _wire.env.InteractRequest()
+        request.close.session_id = "0" * 200
+        with pytest.raises(mazeway.LimitReachedError, match="at most 4096 requests"):
+            for _ in range(20_000):
+                exchange.send(request)
+        exchange.cancel()
+        transport.close()

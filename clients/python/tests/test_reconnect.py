@@ -1,5 +1,7 @@
 """Connections that break and servers that come back."""
 
+import concurrent.futures
+import contextlib
 import signal
 import threading
 import time
@@ -135,20 +137,221 @@ def test_a_recorder_goes_on_with_a_restarted_learner(server, tmp_path):
     process.stop()
 
 
+class Stays(gymnasium.Env):
+    """An environment of this process."""
+
+    observation_space = action_space = gymnasium.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        return 0, {}
+
+    def step(self, action):
+        return 0, 0.0, False, False, {}
+
+
+def late(process, *calls):
+    """Every call of a process that stands still ends in time, by an error."""
+    for call in calls:
+        process.pause()
+        began = time.monotonic()
+        with pytest.raises(mazeway.DeadlineExceededError, match="within 1 s"):
+            call()
+        assert time.monotonic() - began < 10
+        process.resume()  # before its silence breaks the connection
+
+
 def test_no_call_outlives_its_timeout(tmp_path):
     process = start_server(tmp_path)
     client = mazeway.Client(process.address, timeout=1)
     client.list_environments()
     env = mazeway.MazewayEnv("Maze-v0", process.address, timeout=1)
     env.reset(seed=1)
+    drawn = mazeway.MazewayEnv("Maze-v0", process.address, render_mode="ansi", timeout=1)
+    drawn.reset(seed=1)
+    envs = mazeway.MazewayVectorEnv("Maze-v0", 2, process.address, timeout=1)
+    envs.reset(seed=1)
+    closed = mazeway.MazewayVectorEnv("Maze-v0", 2, process.address, timeout=1)
+    closed.reset(seed=1)
+    late(
+        process,
+        client.list_environments,
+        lambda: client.model("Maze-v0"),
+        lambda: client.rollout("Maze-v0"),
+        drawn.render,
+        lambda: env.step(0),
+        lambda: env.reset(seed=1),
+        lambda: mazeway.MazewayEnv("Maze-v0", process.address, timeout=1).reset(),
+        lambda: envs.step([0, 0]),
+        lambda: envs.reset(seed=1),
+        lambda: mazeway.MazewayVectorEnv("Maze-v0", 2, process.address, timeout=1),
+        lambda: next(mazeway.watch("f" * 32, address=process.address, timeout=1)),
+    )
     process.pause()
-    for call in (client.list_environments, lambda: env.step(0), lambda: env.reset(seed=1)):
-        began = time.monotonic()
-        with pytest.raises(mazeway.DeadlineExceededError, match="within 1 s"):
-            call()
-        assert time.monotonic() - began < 10
+    began = time.monotonic()
+    closed.close()  # a courtesy, of which nobody hears
+    client.close()
+    assert time.monotonic() - began < 10
     process.resume()
     env.reset(seed=1)
     env.step(0)
     env.close()
+    envs.reset(seed=1)
+    envs.step([0, 0])
+    envs.close()
+    process.stop()
+
+
+def test_no_call_of_the_learner_outlives_its_timeout(tmp_path):
+    process = start_learner(tmp_path)
+    learner = mazeway.Learner(process.address, timeout=1)
+    learner.models()
+    recorder = mazeway.Recorder(Stays(), "late", process.address, "Stays-v0", timeout=1)
+    recorder.reset()
+    recorder.step(0)
+    late(
+        process,
+        learner.models,
+        learner.fits,
+        lambda: list(learner.fit_trajectories("f" * 32)),
+        lambda: learner.count(style="late"),
+        lambda: learner.trajectories(style="late"),
+        lambda: learner.delete_trajectories(style="late"),
+        lambda: learner.put_model("Stays-v0", np.ones((2, 2, 2)) / 2),
+        lambda: learner.record([demonstration("late")]),
+        lambda: learner.fit("Stays-v0", "late", timeout_secs=1),
+        recorder.reset,
+    )
+    recorder.close()
+    assert recorder.pending == []
+    assert learner.count(style="late", source="python") >= 1
+    learner.close()
+    process.stop()
+
+
+def demonstration(style):
+    return mazeway.Trajectory("Stays-v0", style, 2, 2, np.array([0, 1]), np.array([1, 0]))
+
+
+@contextlib.contextmanager
+def absent(process, start, directory):
+    """A server that is killed now and comes back in a while."""
+    process.stop()
+    again = []
+    timer = threading.Timer(1.5, lambda: again.append(start(directory, listen=process.address)))
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.join()
+        again[0].stop()
+
+
+def test_a_server_that_comes_back_is_waited_for(tmp_path):
+    process = start_server(tmp_path)
+    client = mazeway.Client(process.address)
+    models = client.model("Maze-v0").model_id
+    new, old = (mazeway.MazewayEnv("Maze-v0", process.address) for _ in range(2))
+    batch = mazeway.MazewayVectorEnv("Maze-v0", 3, process.address)
+    assert new.session_id  # its first episode is still to begin
+    old.reset(seed=1)
+    old.step(0)
+    calls = (
+        lambda: client.model("Maze-v0").model_id,
+        lambda: new.reset()[0],
+        lambda: old.reset()[0],
+        lambda: batch.reset()[0],
+    )
+    with absent(process, start_server, tmp_path), concurrent.futures.ThreadPoolExecutor(len(calls)) as pool:
+        model, *observations = [answer.result() for answer in [pool.submit(call) for call in calls]]
+        assert model == models
+        assert [np.shape(observation) for observation in observations] == [(), (), (3,)]
+        for env in (new, old, batch, client):
+            env.close()
+
+
+def test_a_learner_that_comes_back_is_waited_for(tmp_path):
+    process = start_learner(tmp_path)
+    learner = mazeway.Learner(process.address)
+    model = mazeway.Model.from_dense("Stays-v0", np.ones((2, 2, 2)) / 2)
+    learner.put_model(model)
+    first, second = demonstration("absent"), demonstration("absent")
+    assert learner.record([first]) == 1
+    calls = (
+        lambda: learner.put_model(model),
+        lambda: [t.trajectory_id for t in learner.trajectories(env_id="Stays-v0", source="python")],
+        lambda: learner.record([first, second]),
+    )
+    with absent(process, start_learner, tmp_path), concurrent.futures.ThreadPoolExecutor(len(calls)) as pool:
+        answers = [answer.result() for answer in [pool.submit(call) for call in calls]]
+        assert answers[0] == model.model_id
+        assert first.trajectory_id in answers[1]
+        assert answers[2] == 1
+        assert learner.count(style="absent") == 2
+        learner.close()
+
+
+def test_a_server_that_was_never_there_is_not_waited_for():
+    client, learner = mazeway.Client("127.0.0.1:1"), mazeway.Learner("127.0.0.1:1")
+    for call in (
+        lambda: client.model("Maze-v0"),
+        lambda: learner.record([demonstration("nowhere")]),
+        learner.trajectories,
+    ):
+        began = time.monotonic()
+        with pytest.raises(mazeway.ServerUnreachableError, match="hint: start one with"):
+            call()
+        assert time.monotonic() - began < 5
+
+
+def test_a_batch_is_lost_with_its_server_and_begins_anew(tmp_path):
+    process = start_server(tmp_path)
+    envs = gymnasium.make_vec("mazeway/Maze-v0", num_envs=3, address=process.address)
+
+    def step():
+        envs.step([0, 1, 2])
+
+    def step_ahead():
+        envs.unwrapped.send([0, 1, 2])
+        envs.unwrapped.recv()
+
+    for ask in (step, step_ahead):
+        envs.reset(seed=1)
+        envs.step([0, 1, 2])
+        process.stop()
+        process = start_server(tmp_path, listen=process.address)
+        time.sleep(0.2)  # both ends notice
+        with pytest.raises(mazeway.EpisodeLostError, match=r"call reset\(\)") as caught:
+            ask()
+        if ask is step:  # what is sent ahead may go down with its stream
+            assert isinstance(caught.value, mazeway.SessionLostError)
+            assert "the server was restarted or the lease has run out" in str(caught.value)
+            # No lease outlives its server.
+            assert "lease_secs" not in str(caught.value)
+        with pytest.raises(mazeway.ResetNeededError):
+            ask()
+    reference = gymnasium.make_vec("mazeway/Maze-v0", num_envs=3, address=process.address)
+    assert repr(envs.reset(seed=5)) == repr(reference.reset(seed=5))
+    assert repr(envs.step([3, 3, 3])) == repr(reference.step([3, 3, 3]))
+    envs.close()
+    reference.close()
+    process.stop()
+
+
+def test_streams_that_have_said_all_end_as_they_should(tmp_path):
+    process = start_learner(tmp_path, "--metrics-listen", "127.0.0.1:0")
+    for _ in range(3):
+        recorder = mazeway.Recorder(Stays(), "said", process.address, "Stays-v0")
+        recorder.reset()
+        recorder.step(0)
+        recorder.close()
+    with mazeway.Learner(process.address) as learner:
+        assert learner.record([demonstration("said")]) == 1
+        assert learner.count(style="said") == 4
+    deadline = time.monotonic() + 10
+    while time.monotonic() < deadline and process.calls().get(("RecordTrajectories", "OK"), 0) < 4:
+        time.sleep(0.05)
+    recorded = {
+        code: calls for (method, code), calls in process.calls().items() if method == "RecordTrajectories"
+    }
+    assert recorded == {"OK": 4}
     process.stop()

@@ -69,6 +69,49 @@ def test_nothing_to_see_within_the_timeout(server):
     env.close()
 
 
+def test_a_session_at_rest_is_waited_for(server, monkeypatch):
+    monkeypatch.setattr("mazeway.watching._SILENCE_SECS", 0.3)
+    env = mazeway.MazewayEnv("Maze-v0", server)
+    frames = mazeway.watch(env, mode="ansi", max_fps=60)
+    for act in (lambda: env.reset(seed=1), lambda: env.step(0)):
+        timer = threading.Timer(1.5, act)  # by then it was asked for several times
+        timer.start()
+        next(frames)
+        timer.join()
+    env.close()
+    assert next(frames, None) is None
+
+
+def test_a_server_without_a_sign_of_life_ends_the_watch(tmp_path, monkeypatch):
+    process = start_server(tmp_path)
+    env = mazeway.MazewayEnv("Maze-v0", process.address)
+    env.reset(seed=1)
+    monkeypatch.setattr("mazeway.watching._SILENCE_SECS", 0.5)
+    frames = mazeway.watch(env)
+    next(frames)
+    process.pause()
+    began = time.monotonic()
+    with pytest.raises(mazeway.DeadlineExceededError, match=r"within 0\.5 s"):
+        next(frames)
+    assert time.monotonic() - began < 10
+    process.stop()
+
+
+def test_a_frozen_server_is_found_out_by_its_pings(tmp_path):
+    process = start_server(tmp_path)
+    env = mazeway.MazewayEnv("Maze-v0", process.address)
+    env.reset(seed=1)
+    frames = mazeway.watch(env, timeout=100)
+    next(frames)
+    process.pause()
+    began = time.monotonic()
+    with pytest.raises(mazeway.ServerUnreachableError):
+        next(frames)
+    # A ping after ten seconds, and as long for its answer.
+    assert 10 < time.monotonic() - began < 40
+    process.stop()
+
+
 def test_a_server_that_dies_ends_the_watch(tmp_path):
     process = start_server(tmp_path)
     env = mazeway.MazewayEnv("Maze-v0", process.address)

@@ -19,6 +19,8 @@ const BATCH_TRAJECTORIES: usize = 256;
 const BATCH_BYTES: usize = 1 << 20;
 /// Requests that are under way at a time.
 const IN_FLIGHT: usize = 16;
+/// How long the end of a stream that has said all may take.
+const FAREWELL: Duration = Duration::from_secs(1);
 /// First and longest pause between two attempts to reach the learner.
 const PAUSES: (Duration, Duration) = (Duration::from_millis(50), Duration::from_secs(2));
 
@@ -179,7 +181,14 @@ impl Recorder {
     /// # Errors
     /// As [`Recorder::flush`].
     pub async fn finish(mut self) -> Result<Receipt, ClientError> {
-        self.flush().await
+        let receipt = self.flush().await?;
+        if let Some(Open { requests, mut answers, .. }) = self.stream.take() {
+            // A learner counts a stream that is dropped before its end as one whose caller has gone.
+            drop(requests);
+            let end = async { while let Ok(Some(_)) = answers.message().await {} };
+            let _ = timeout(self.deadline.min(FAREWELL), end).await;
+        }
+        Ok(receipt)
     }
 
     /// What is acknowledged so far.

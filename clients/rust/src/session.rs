@@ -13,10 +13,13 @@ use crate::{
 };
 use mazeway_proto::env::{self as pb, AutoresetMode, interact_response::Response};
 use std::time::Duration;
-use tonic::{Code, Status};
+use tokio::time::timeout;
+use tonic::Code;
 
 /// First and longest pause between two attempts to take a session up again.
 const PAUSES: (Duration, Duration) = (Duration::from_millis(5), Duration::from_millis(500));
+/// How long the end of a session that was dropped may take; after that the lease ends it.
+const FAREWELL: Duration = Duration::from_secs(10);
 /// Requests that may be sent before the first of their answers is received.
 const MAX_UNDER_WAY: usize = 4096;
 
@@ -134,11 +137,12 @@ impl Session {
     }
 
     /// Opens a stream where there is none.
-    async fn ensure_open(&mut self) -> Result<(), Status> {
+    async fn ensure_open(&mut self) -> Result<(), Attempt> {
         if self.open.is_none() {
             let opening = self.patience.wait(Open::new(self.connection.wire.clone())).await;
-            let opened = opening.unwrap_or_else(|late| Err(Status::unavailable(late.to_string())))?;
-            self.open = Some(opened);
+            // Nothing was sent yet: whatever broke here may be tried again. But the caller waits no longer than was said.
+            let opened = opening.map_err(Attempt::last)?;
+            self.open = Some(opened.map_err(|status| Attempt { retry: is_broken(&status), error: status.into() })?);
         }
         Ok(())
     }
@@ -154,7 +158,7 @@ impl Session {
         if self.closed {
             return Err(ClientError::Argument { field: "session_id", message: "the environment was closed".into() });
         }
-        self.ensure_open().await?;
+        self.ensure_open().await.map_err(|attempt| attempt.error)?;
         let too_many = |message| Err(ClientError::Argument { field: "request", message });
         let awaited = self.open.as_ref().map_or(0, |open| open.awaited);
         if awaited == MAX_UNDER_WAY {
@@ -252,9 +256,7 @@ impl Session {
             return Err(Attempt::last(ClientError::Argument { field: "session_id", message }));
         }
         let fresh = self.open.is_none();
-        // Nothing was sent yet: whatever fails here may be tried again.
-        let opened = self.ensure_open().await;
-        opened.map_err(|status| Attempt { retry: is_broken(&status), error: status.into() })?;
+        self.ensure_open().await?;
         if self.write(ask).await.map_err(Attempt::last)? != Sent::Yes {
             let message = self.last_words().await;
             return Err(Attempt { retry: true, error: ClientError::Interrupted { request: ask.name(), message } });
@@ -338,13 +340,14 @@ impl Drop for Session {
             return;
         }
         let (open, id, mut service) = (self.open.take(), std::mem::take(&mut self.id), self.connection.service.clone());
-        runtime.spawn(async move {
+        let farewell = async move {
             // Our half of the stream ends first, and then the server's, which puts the session back.
             if let Some(open) = open {
                 open.finish().await;
             }
             let _ = service.close_session(pb::CloseSessionRequest { session_id: id }).await;
-        });
+        };
+        runtime.spawn(timeout(self.connection.wire.deadline.min(FAREWELL), farewell));
     }
 }
 

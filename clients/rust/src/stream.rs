@@ -305,7 +305,8 @@ impl Open {
         outbox.abandoned && !outbox.bytes.is_empty()
     }
 
-    /// Ends this side's half and waits for the other's.
+    /// Ends this side's half and waits for the other's, for as long as the caller does: a server that stands still never ends
+    /// it.
     pub async fn finish(mut self) {
         self.outbox.end();
         while let Ok(Some(_)) = self.answers.message().await {}

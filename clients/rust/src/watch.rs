@@ -3,7 +3,8 @@
 use crate::{ClientError, Connection};
 use bytes::Bytes;
 use mazeway_proto::env as pb;
-use tonic::Streaming;
+use tokio::time::timeout;
+use tonic::{Code, Streaming};
 
 /// What a picture is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -51,16 +52,29 @@ pub struct Frame {
 
 /// Pictures as they come. Dropping it ends the watch.
 #[derive(Debug)]
-pub struct Frames(Streaming<pb::WatchResponse>);
+pub struct Frames {
+    connection: Connection,
+    answers: Streaming<pb::WatchResponse>,
+}
 
 impl Frames {
     /// The next picture, once something has changed; `None` once the session has ended. A reader that comes late finds the
     /// later picture.
     ///
+    /// It waits for as long as nothing happens in the environment. Where there is no picture within
+    /// [`ConnectOptions::deadline`](crate::ConnectOptions::deadline), the server is asked whether it is there, and has as long
+    /// to say so: then the wait goes on.
+    ///
     /// # Errors
-    /// No such session or environment, a limit, a server that goes away.
+    /// No such session or environment, a limit; a server that goes away, or gives no sign of life.
     pub async fn next(&mut self) -> Result<Option<Frame>, ClientError> {
-        let Some(answer) = self.0.message().await? else { return Ok(None) };
+        let answer = loop {
+            match timeout(self.connection.wire.deadline, self.answers.message()).await {
+                Ok(answer) => break answer?,
+                Err(_) => self.connection.ask_whether_it_is_there().await?,
+            }
+        };
+        let Some(answer) = answer else { return Ok(None) };
         let pb::WatchResponse { content, width, height, step, episode_step, episode_ended, skipped } = answer;
         Ok(Some(Frame { content, width, height, step, episode_step, episode_ended, skipped }))
     }
@@ -84,6 +98,15 @@ impl Connection {
             max_fps: options.max_fps.unwrap_or_default(),
             max_width: options.max_width.unwrap_or_default(),
         };
-        Ok(Frames(self.wire.within(self.service.clone().watch(request)).await?))
+        let answers = self.wire.within(self.service.clone().watch(request)).await?;
+        Ok(Frames { connection: self.clone(), answers })
+    }
+
+    /// Asks the server for what anybody may ask; a refusal is a sign of life as well.
+    async fn ask_whether_it_is_there(&self) -> Result<(), ClientError> {
+        match self.wire.within(self.service.clone().list_environments(pb::ListEnvironmentsRequest {})).await {
+            Err(error) if matches!(error.code(), Code::DeadlineExceeded | Code::Unavailable) => Err(error),
+            _ => Ok(()),
+        }
     }
 }

@@ -15,7 +15,7 @@ import time
 import weakref
 from collections.abc import Callable, Iterable, Iterator
 from queue import SimpleQueue
-from typing import Any
+from typing import Any, TypeVar
 
 import grpc
 
@@ -30,6 +30,8 @@ from mazeway._transport import (
     reconnecting,
 )
 from mazeway.errors import MazewayError, ServerFailureError, ServerUnreachableError, from_status
+
+T = TypeVar("T")
 
 #: How long a fork waits for a call that another thread is making.
 _FORK_WAIT_SECS = 5.0
@@ -63,6 +65,8 @@ class GrpcTransport:
             # A peer that vanished without a word is found out.
             ("grpc.keepalive_time_ms", 10_000),
             ("grpc.keepalive_timeout_ms", 10_000),
+            # The same by another name, whose default of a minute would else be what counts.
+            ("grpc.http2.ping_timeout_ms", 10_000),
             ("grpc.http2.max_pings_without_data", 0),
         ]
         if target.startswith("unix:"):
@@ -73,7 +77,7 @@ class GrpcTransport:
         self._target, self._secure, self._options = target, secure, options
         self._credentials = credentials or Credentials()
         #: True once the server has answered: from then on it is waited for when it goes away.
-        self._known = False
+        self.known = False
         self._channel: Any = None
         self._callables: dict[str, Callable[..., Any]] = {}
         self._exchanges: weakref.WeakSet[_GrpcAnswers] = weakref.WeakSet()
@@ -88,47 +92,62 @@ class GrpcTransport:
     def unary(self, method: str, request: Any, *, timeout: float) -> Any:
         """See `Transport`."""
 
-        def call() -> Any:
+        def call(left: float) -> Any:
             with self._translated(timeout), self._lock:
-                answer = self._callable(method)(request, timeout=timeout)
-            self._known = True
-            return answer
+                return self._callable(method)(request, timeout=left)
 
-        return reconnecting(call, timeout) if self._known and method in REPEATABLE else call()
+        return self._repeated(method, call, timeout)
 
-    def responses(self, method: str, request: Any, *, timeout: float, each: bool = False) -> Iterator[Any]:
+    def responses(
+        self,
+        method: str,
+        request: Any,
+        *,
+        timeout: float,
+        each: bool = False,
+        alive: Callable[[], object] | None = None,
+    ) -> Iterator[Any]:
         """See `Transport`."""
-        if each:
-            yield from self._patient_responses(method, request, timeout)
-            return
-        with self._translated(timeout), self._counted():
-            with self._lock:
-                call = self._callable(method)(request, timeout=timeout)
-            try:
-                yield from call
-            finally:
-                call.cancel()
+        deadline = time.monotonic() + timeout
 
-    def _patient_responses(self, method: str, request: Any, timeout: float) -> Iterator[Any]:
-        with self._counted():
-            with self._translated(timeout), self._lock:
-                answers = _GrpcAnswers(self, self._callable(method)(request), timeout)
-                self._exchanges.add(answers)
-            try:
-                while True:
-                    answer = answers.next()
-                    if answer is None:
-                        return
-                    yield answer
-            finally:
-                answers.cancel()
+        def begin(_left: float) -> tuple[contextlib.ExitStack, _GrpcAnswers, Any]:
+            with contextlib.ExitStack() as stack:
+                stack.enter_context(self._counted())
+                with self._translated(timeout), self._lock:
+                    whole = None if each else max(deadline - time.monotonic(), 0.0)
+                    call = self._callable(method)(request, timeout=whole)
+                    answers = _GrpcAnswers(self, call, timeout, watched=each, ask=alive)
+                    if each:
+                        self._exchanges.add(answers)
+                stack.callback(answers.cancel)
+                answer = answers.next()
+                return stack.pop_all(), answers, answer
+
+        # Until the first answer the call may be made anew.
+        stack, answers, answer = self._repeated(method, begin, timeout)
+        with stack:
+            while answer is not None:
+                yield answer
+                answer = answers.next()
 
     def requests(self, method: str, requests: Iterable[Any], *, timeout: float) -> Any:
         """See `Transport`."""
-        with self._translated(timeout), self._counted():
-            with self._lock:
-                call = self._callable(method)
-            return call(iter(requests), timeout=timeout)
+        messages = list(requests)
+
+        def call(left: float) -> Any:
+            with self._translated(timeout), self._counted():
+                with self._lock:
+                    made = self._callable(method)
+                return made(iter(messages), timeout=left)
+
+        return self._repeated(method, call, timeout)
+
+    def _repeated(self, method: str, call: Callable[[float], T], timeout: float) -> T:
+        """Calls, again where that is harmless and a server that was there has gone."""
+        repeat = self.known and method in REPEATABLE
+        answer = reconnecting(call, timeout) if repeat else call(timeout)
+        self.known = True
+        return answer
 
     def exchange(self, method: str, *, timeout: float) -> Exchange:
         """See `Transport`."""
@@ -250,17 +269,29 @@ class _GrpcAnswers:
     """The answers of a stream over grpcio, with a deadline on each.
 
     A gRPC deadline covers a whole stream and grpcio's iterator waits for ever, so the watchdog thread
-    cancels the call when an answer is late.
+    cancels the call when an answer is late, or asks first whether the server is there.
     """
 
-    def __init__(self, transport: GrpcTransport, call: Any, timeout: float) -> None:
+    def __init__(
+        self,
+        transport: GrpcTransport,
+        call: Any,
+        timeout: float,
+        *,
+        watched: bool = True,
+        ask: Callable[[], object] | None = None,
+    ) -> None:
         self._transport = transport
         self.alive = True
         self._call = call
         self.timeout = timeout
         self.waiting_since: float | None = None
-        self.expired = False
-        if timeout < math.inf:
+        #: Why it was ended here.
+        self._failure: MazewayError | None = None
+        self._ask = ask
+        #: When the server was asked last whether it is there; infinity meanwhile.
+        self._asked = 0.0
+        if watched and timeout < math.inf:
             _watchdog.watch(self)
 
     @property
@@ -281,14 +312,37 @@ class _GrpcAnswers:
         except StopIteration:
             return None
         except grpc.RpcError as error:
-            if self.expired:
-                raise late(self._transport.address, self.timeout) from None
+            if self._failure is not None:
+                raise self._failure from None
             raise self._transport.translate(error, self.timeout) from None
         finally:
             self.waiting_since = None
             if answer is None:  # also by a KeyboardInterrupt, after which answers are out of step
                 self.cancel()
         return answer
+
+    def look(self, now: float) -> None:
+        """Ends the call where its answer is late and the server is not there; never waits."""
+        since = self.waiting_since
+        if since is None or now - max(since, self._asked) <= self.timeout:
+            return
+        if self._ask is None:
+            self._fail(late(self._transport.address, self.timeout))
+        else:
+            self._asked = math.inf
+            threading.Thread(target=self._ask_now, args=(self._ask,), daemon=True).start()
+
+    def _ask_now(self, ask: Callable[[], object]) -> None:
+        try:
+            ask()
+        except MazewayError as error:
+            self._fail(error)
+        finally:
+            self._asked = time.monotonic()
+
+    def _fail(self, failure: MazewayError) -> None:
+        self._failure = failure
+        self.cancel()
 
     def cancel(self) -> None:
         self.alive = False
@@ -310,6 +364,7 @@ class _GrpcExchange(_GrpcAnswers):
         lock: contextlib.AbstractContextManager[Any],
     ) -> None:
         self._lock = lock
+        # Bounded by those who send: see `Exchange`.
         self._requests: SimpleQueue[Any] = SimpleQueue()
         super().__init__(transport, method(iter(self._requests.get, None)), timeout)
 
@@ -324,6 +379,13 @@ class _GrpcExchange(_GrpcAnswers):
                 f"the server at {self._transport.address} ended the stream without an answer"
             )
         return answer
+
+    def finish(self, timeout: float) -> None:
+        self._requests.put(None)
+        self.timeout = timeout
+        with self._lock:
+            while self.next() is not None:
+                pass
 
     def cancel(self) -> None:
         self._requests.put(None)  # ends the request iterator and so grpcio's thread
@@ -362,10 +424,7 @@ class _Watchdog:
             period = 1.0
             for exchange in exchanges:
                 period = min(period, max(exchange.timeout / 4, 0.005))
-                since = exchange.waiting_since
-                if since is not None and now - since > exchange.timeout:
-                    exchange.expired = True
-                    exchange.cancel()
+                exchange.look(now)
             del exchange, exchanges  # hold no exchange while asleep
             self._wake.wait(period)
             self._wake.clear()

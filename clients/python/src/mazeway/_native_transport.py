@@ -10,13 +10,15 @@ from __future__ import annotations
 import contextlib
 import os
 import time
-from collections.abc import Iterable, Iterator
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, TypeVar
 
 from mazeway import _native, _wire
 from mazeway._access import Credentials
 from mazeway._transport import REPEATABLE, START, Exchange, late, reconnecting
 from mazeway.errors import MazewayError, ServerFailureError, from_status
+
+T = TypeVar("T")
 
 _keeper: tuple[int, _native.Keeper] | None = None
 
@@ -48,36 +50,59 @@ class NativeTransport:
         self._secure = secure
         self._credentials = credentials or Credentials()
         #: True once the server has answered: from then on it is waited for when it goes away.
-        self._known = False
+        self.known = False
         self._pid = os.getpid()
 
     def unary(self, method: str, request: Any, *, timeout: float) -> Any:
         """See `Transport`."""
         called = self._methods[method]
 
-        def call() -> bytes:
+        def call(left: float) -> bytes:
             with self.translated(timeout):
-                answer = self.channel().unary(called.path, request.SerializeToString(), timeout)
-            self._known = True
-            return answer
+                return self.channel().unary(called.path, request.SerializeToString(), left)
 
-        repeat = self._known and method in REPEATABLE
-        return called.response.FromString(reconnecting(call, timeout) if repeat else call())
+        return called.response.FromString(self._repeated(method, call, timeout))
 
-    def responses(self, method: str, request: Any, *, timeout: float, each: bool = False) -> Iterator[Any]:
+    def responses(
+        self,
+        method: str,
+        request: Any,
+        *,
+        timeout: float,
+        each: bool = False,
+        alive: Callable[[], object] | None = None,
+    ) -> Iterator[Any]:
         """See `Transport`."""
         called = self._methods[method]
         deadline = time.monotonic() + timeout
-        with self.translated(timeout):
-            answers = self.channel().answers(called.path, request.SerializeToString())
-        try:
+
+        def begin(_left: float) -> tuple[_native.Answers, bytes | None]:
+            with self.translated(timeout):
+                answers = self.channel().answers(called.path, request.SerializeToString())
+            try:
+                return answers, receive(answers)
+            except BaseException:
+                answers.cancel()
+                raise
+
+        def receive(answers: _native.Answers) -> bytes | None:
             while True:
-                with self.translated(timeout):
-                    left = timeout if each else max(deadline - time.monotonic(), 0.0)
-                    answer = answers.receive(left)
-                if answer is None:
-                    return
+                left = timeout if each else max(deadline - time.monotonic(), 0.0)
+                try:
+                    return answers.receive(left)
+                except _native.LateError as error:
+                    if alive is None:
+                        raise self.translate(error, timeout) from None
+                except _native.CallError as error:
+                    raise self.translate(error, timeout) from None
+                alive()
+
+        # Until the first answer the call may be made anew.
+        answers, answer = self._repeated(method, begin, timeout)
+        try:
+            while answer is not None:
                 yield called.response.FromString(answer)
+                answer = receive(answers)
         finally:
             if self._pid == os.getpid():
                 answers.cancel()
@@ -86,9 +111,19 @@ class NativeTransport:
         """See `Transport`."""
         called = self._methods[method]
         packed = [request.SerializeToString() for request in requests]
-        with self.translated(timeout):
-            answer = self.channel().requests(called.path, packed, timeout)
-        return called.response.FromString(answer)
+
+        def call(left: float) -> bytes:
+            with self.translated(timeout):
+                return self.channel().requests(called.path, packed, left)
+
+        return called.response.FromString(self._repeated(method, call, timeout))
+
+    def _repeated(self, method: str, call: Callable[[float], T], timeout: float) -> T:
+        """Calls, again where that is harmless and a server that was there has gone."""
+        repeat = self.known and method in REPEATABLE
+        answer = reconnecting(call, timeout) if repeat else call(timeout)
+        self.known = True
+        return answer
 
     def exchange(self, method: str, *, timeout: float) -> Exchange:
         """See `Transport`."""
@@ -147,7 +182,10 @@ class _NativeExchange:
 
     def send(self, request: Any) -> None:
         """See `Exchange`."""
-        self._stream.send(request.SerializeToString())
+        try:
+            self._stream.send(request.SerializeToString())
+        except _native.CallError as error:
+            raise self._transport.translate(error, self.timeout) from None
 
     def receive(self) -> Any:
         """See `Exchange`."""
@@ -163,6 +201,16 @@ class _NativeExchange:
                 f"the server at {self._transport.address} ended the stream without an answer"
             )
         return self._response.FromString(answer)
+
+    def finish(self, timeout: float) -> None:
+        """See `Exchange`."""
+        try:
+            self._stream.end()
+            with self._transport.translated(timeout):
+                while self._stream.receive(timeout) is not None:
+                    pass
+        finally:
+            self.cancel()
 
     def cancel(self) -> None:
         """See `Exchange`."""

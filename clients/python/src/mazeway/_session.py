@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import time
 import weakref
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -21,7 +22,7 @@ from mazeway import _arrays, _wire
 from mazeway._access import Access
 from mazeway._link import First, Link, Stepped, SteppedOne
 from mazeway._link import link as make_link
-from mazeway._transport import Transport, choose, connect
+from mazeway._transport import RECONNECT_SECS, Transport, choose, connect, reconnecting
 from mazeway.errors import (
     ConnectionLostError,
     DeadlineExceededError,
@@ -105,6 +106,8 @@ class Session:
         #: True where a step makes sense.
         self.started = False
         self.spec: Any = None
+        #: True once the server has answered: from then on it is waited for when it goes away.
+        self._known = False
         self.closed = False
         self._create = _wire.env.CreateSessionRequest(
             env_id=env_id,
@@ -128,7 +131,7 @@ class Session:
     def __getstate__(self) -> dict[str, Any]:
         """Everything but the connection, which belongs to this process."""
         state = self.__dict__.copy()
-        state.update(_connection=None, _finalizer=None, seeded=False, started=False, pending=0)
+        state.update(_connection=None, _finalizer=None, _known=False, seeded=False, started=False, pending=0)
         for key in ("_create", "spec"):
             message = state[key]
             state[key] = None if message is None else message.SerializeToString()
@@ -188,8 +191,9 @@ class Session:
         draw: Callable[[], int] | None,
         whole: bool,
     ) -> T:
+        began = time.monotonic()
         for attempt in (0, 1):
-            fresh = self._ensure()
+            fresh = self._ensure(RECONNECT_SECS - (time.monotonic() - began))
             self._refuse_pending("reset")
             first = draw() if seed is None and draw is not None and not self.seeded else seed
             assert self._connection is not None
@@ -298,8 +302,12 @@ class Session:
         if self.closed:
             raise ResetNeededError("the environment is closed", hint="make a new one")
 
-    def _ensure(self) -> bool:
-        """Opens a session where there is none; returns whether it did."""
+    def _ensure(self, within: float = RECONNECT_SECS) -> bool:
+        """Opens a session where there is none; returns whether it did.
+
+        Args:
+            within: How long a server is waited for that has answered this session before.
+        """
         self._refuse_closed()
         if self._connection is not None:
             if self._connection.pid == os.getpid():
@@ -307,12 +315,17 @@ class Session:
             self._drop()
         transport = connect(self.address, _wire.ENVIRONMENT_SERVICE, self.access)
         try:
-            response = transport.unary("CreateSession", self._create, timeout=self.timeout)
+
+            def create(_left: float = 0.0) -> Any:
+                return transport.unary("CreateSession", self._create, timeout=self.timeout)
+
+            response = reconnecting(create, self.timeout, within) if self._known else create()
             link = make_link(transport, response, self.timeout)
         except BaseException:
             transport.close()
             raise
         self.spec = response.spec
+        self._known = True
         self._connection = _Connection(transport, link, response.session_id, self.timeout, os.getpid())
         self._finalizer = weakref.finalize(self, self._connection.release)
         return True
@@ -355,7 +368,11 @@ def _interrupted(error: ServerUnreachableError) -> ConnectionLostError:
 
 
 def _lost(error: MazewayError) -> SessionLostError:
+    message = f"the server no longer knows the session ({error.message})"
+    if isinstance(error, NotFoundError):  # it does not say why, and may not be the one that made it
+        return SessionLostError(
+            message, hint="the server was restarted or the lease has run out; call reset() to begin anew"
+        )
     return SessionLostError(
-        f"the server no longer knows the session ({error.message})",
-        hint="call reset() to begin anew; a longer `lease_secs` keeps an idle session alive",
+        message, hint="call reset() to begin anew; a longer `lease_secs` keeps an idle session alive"
     )

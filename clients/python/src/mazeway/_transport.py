@@ -78,10 +78,16 @@ class Exchange(Protocol):
         """Whether the stream has ended, as far as is known here: one may break while nobody looks."""
 
     def send(self, request: Any) -> None:
-        """Queues a request; never blocks."""
+        """Queues a request; never blocks.
+
+        Whoever sends bounds what is sent and not answered: `Session` (`MAX_PENDING`), `Uploader`.
+        """
 
     def receive(self) -> Any:
         """Waits for the next answer; raises `MazewayError`, after which the stream is over."""
+
+    def finish(self, timeout: float) -> None:
+        """Says that no more requests will come, and reads to the end."""
 
     def cancel(self) -> None:
         """Ends the stream at once; may be called twice."""
@@ -92,14 +98,25 @@ class Transport(Protocol):
 
     address: str
     service: str
+    #: True once the server has answered: from then on it is waited for when it goes away.
+    known: bool
 
     def unary(self, method: str, request: Any, *, timeout: float) -> Any:
         """One request, one answer."""
 
-    def responses(self, method: str, request: Any, *, timeout: float, each: bool = False) -> Iterator[Any]:
+    def responses(
+        self,
+        method: str,
+        request: Any,
+        *,
+        timeout: float,
+        each: bool = False,
+        alive: Callable[[], object] | None = None,
+    ) -> Iterator[Any]:
         """One request, many answers. Closing the iterator cancels the call.
 
-        The timeout is for the whole call, or with `each` for the wait for any one answer.
+        The timeout is for the whole call, or with `each` for the wait for any one answer. With `alive` too,
+        a late answer is waited for again where that returns, and what it raises ends the call.
         """
 
     def requests(self, method: str, requests: Iterable[Any], *, timeout: float) -> Any:
@@ -202,12 +219,13 @@ class Backoff:
         return True
 
 
-def reconnecting(call: Callable[[], T], timeout: float) -> T:
-    """Calls until the server answers, within bounds."""
-    backoff = Backoff(min(RECONNECT_SECS, 0.8 * timeout))
+def reconnecting(call: Callable[[float], T], timeout: float, within: float = RECONNECT_SECS) -> T:
+    """Calls, with the seconds that are left of the timeout, until the server answers, within bounds."""
+    deadline = time.monotonic() + timeout
+    backoff = Backoff(min(within, 0.8 * timeout))
     while True:
         try:
-            return call()
+            return call(max(deadline - time.monotonic(), 0.0))
         except ServerUnreachableError:
             if not backoff.pause():
                 raise

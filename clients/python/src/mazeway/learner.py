@@ -12,7 +12,8 @@ import numpy.typing as npt
 from mazeway import _wire
 from mazeway._access import Access
 from mazeway._session import DEFAULT_TIMEOUT_SECS
-from mazeway._transport import connect
+from mazeway._transport import RECONNECT_SECS, connect
+from mazeway._uploader import Uploader, batches
 from mazeway.env import server_env_id
 from mazeway.errors import InvalidArgumentError, ServerFailureError
 from mazeway.fit import Fit, FitSummary, ModelSummary, Progress, Queued, options_to_wire, stopped_name
@@ -20,8 +21,6 @@ from mazeway.model import Model
 from mazeway.trajectory import Trajectory, timestamp
 
 DEFAULT_LEARNER_ADDRESS = "127.0.0.1:50052"
-_TRAJECTORIES_PER_REQUEST = 500
-_STEPS_PER_REQUEST = 100_000
 
 
 class Learner:
@@ -205,16 +204,19 @@ class Learner:
         return self._transport.unary("DeleteTrajectories", request, timeout=self.timeout).deleted
 
     def record(self, trajectories: Iterable[Trajectory]) -> int:
-        """Stores demonstrations durably; returns how many were not stored before."""
-        exchange = self._transport.exchange("RecordTrajectories", timeout=self.timeout)
-        stored = 0
+        """Stores demonstrations durably; returns how many were not stored before.
+
+        Where the connection breaks, what is not acknowledged goes out again under the same ids and so is
+        stored once; what was stored already counts as stored before then.
+        """
+        uploader = Uploader(lambda: self._transport, self.timeout, shared=True)
         try:
-            for batch in _batches(trajectories):
-                exchange.send(_wire.learner.RecordTrajectoriesRequest(trajectories=batch))
-                stored += exchange.receive().stored
+            for batch in batches(trajectories):
+                uploader.put(batch)
+                uploader.flush(within=min(RECONNECT_SECS, 0.8 * self.timeout) if self._transport.known else 0)
         finally:
-            exchange.cancel()
-        return stored
+            uploader.finish()
+        return uploader.stored
 
     def models(self, env_id: str = "") -> list[ModelSummary]:
         """The models that the learner knows."""
@@ -296,17 +298,3 @@ def _assign(message: Any, name: str, value: npt.ArrayLike) -> None:
         setattr(message, name, value)
     except (TypeError, ValueError) as error:
         raise InvalidArgumentError(f"{name}: {error}", field=name) from None
-
-
-def _batches(trajectories: Iterable[Trajectory]) -> Iterator[list[Any]]:
-    """Wire messages in requests of bounded size."""
-    batch: list[Any] = []
-    steps = 0
-    for trajectory in trajectories:
-        batch.append(trajectory.to_wire())
-        steps += len(trajectory)
-        if len(batch) >= _TRAJECTORIES_PER_REQUEST or steps >= _STEPS_PER_REQUEST:
-            yield batch
-            batch, steps = [], 0
-    if batch:
-        yield batch

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import os
 from typing import Any, SupportsFloat
 
@@ -13,16 +14,11 @@ import numpy as np
 from mazeway import _wire
 from mazeway._access import Access, Secret
 from mazeway._session import DEFAULT_TIMEOUT_SECS
-from mazeway._transport import Backoff, Exchange, Transport, connect
+from mazeway._transport import connect
+from mazeway._uploader import Uploader
 from mazeway.client import Client
 from mazeway.env import MazewayEnv, server_env_id
-from mazeway.errors import (
-    AlreadyExistsError,
-    DeadlineExceededError,
-    InvalidArgumentError,
-    MazewayError,
-    ServerUnreachableError,
-)
+from mazeway.errors import InvalidArgumentError
 from mazeway.learner import DEFAULT_LEARNER_ADDRESS, Learner
 from mazeway.model import Model
 from mazeway.trajectory import Trajectory
@@ -108,14 +104,15 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordCons
         self._n_states, self._first_state = int(observations.n), int(observations.start)
         self._n_actions, self._first_action = int(actions.n), int(actions.start)
         self._access = Access(client, token, ca, cert, key, insecure)
-        self._uploader = _Uploader(address, timeout, self._access)
+        dial = functools.partial(connect, address, _wire.LEARNER_SERVICE, self._access)
+        self._uploader = Uploader(dial, timeout)
         self._timeout = timeout
         self._forget()
 
     @property
     def pending(self) -> list[Trajectory]:
         """Episodes that the learner has not acknowledged."""
-        return list(self._uploader.pending.values())
+        return self._uploader.pending
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -150,7 +147,7 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordCons
         try:
             self._end_episode()
             self._uploader.flush()
-            self._uploader.close()
+            self._uploader.finish()
         finally:
             self.env.close()
 
@@ -166,21 +163,23 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordCons
     def _end_episode(self) -> None:
         """Queues the episode, where it has a step; does not wait."""
         if self._actions:
-            self._uploader.send(
-                Trajectory(
-                    env_id=self.recorded_env_id,
-                    style=self.style,
-                    n_states=self._n_states,
-                    n_actions=self._n_actions,
-                    states=np.array(self._states[:-1], np.int32),
-                    actions=np.array(self._actions, np.int32),
-                    rewards=np.array(self._rewards),
-                    final_state=self._states[-1],
-                    terminated=self._terminated,
-                    truncated=self._truncated,
-                    model_id=self.model_id or "",
-                    source=self.source,
-                )
+            self._uploader.put(
+                [
+                    Trajectory(
+                        env_id=self.recorded_env_id,
+                        style=self.style,
+                        n_states=self._n_states,
+                        n_actions=self._n_actions,
+                        states=np.array(self._states[:-1], np.int32),
+                        actions=np.array(self._actions, np.int32),
+                        rewards=np.array(self._rewards),
+                        final_state=self._states[-1],
+                        terminated=self._terminated,
+                        truncated=self._truncated,
+                        model_id=self.model_id or "",
+                        source=self.source,
+                    )
+                ]
             )
         self._forget()
 
@@ -211,85 +210,3 @@ def _env_id(env: gymnasium.Env[Any, Any]) -> str:
     if env.spec is None:
         raise InvalidArgumentError(f"env_id: expected a name, for {env} has none of its own", field="env_id")
     return server_env_id(env.spec.id)
-
-
-class _Uploader:
-    """Sends trajectories over one stream, and again over another where that breaks."""
-
-    def __init__(self, address: str, timeout: float, access: Access) -> None:
-        self._address = address
-        self._access = access
-        self._timeout = timeout
-        #: Not acknowledged, in the order of sending; the learner knows a repeated id.
-        self.pending: dict[str, Trajectory] = {}
-        self._transport: Transport | None = None
-        self._exchange: Exchange | None = None
-        self._pid = os.getpid()
-        #: How many requests of the present stream are not answered.
-        self._in_flight = 0
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Everything but the connection, which belongs to this process."""
-        return {**self.__dict__, "_transport": None, "_exchange": None, "_in_flight": 0}
-
-    def send(self, trajectory: Trajectory) -> None:
-        """Queues and, where there is a stream, sends at once; never waits and never fails."""
-        self.pending[trajectory.trajectory_id] = trajectory
-        if self._exchange is not None and self._exchange.alive and self._pid == os.getpid():
-            self._submit([trajectory])
-
-    def flush(self) -> None:
-        """Waits until nothing is pending, trying again after a failure until the timeout."""
-        backoff = Backoff(self._timeout, first=0.05)
-        while self.pending:
-            try:
-                self._attempt()
-            except (ServerUnreachableError, DeadlineExceededError):
-                self.close()
-                if not backoff.pause():
-                    raise
-            except (InvalidArgumentError, AlreadyExistsError) as error:
-                # Refused for good: a retry would fail for ever and hold back what follows.
-                self.close()
-                refused = list(self.pending.values())
-                self.pending.clear()
-                error.refused = refused  # type: ignore[union-attr]
-                raise
-            except MazewayError:
-                self.close()
-                raise
-
-    def close(self) -> None:
-        """Drops the connection; what is pending stays."""
-        if self._pid == os.getpid():
-            if self._exchange is not None:
-                self._exchange.cancel()
-            if self._transport is not None:
-                self._transport.close()
-        self._exchange = self._transport = None
-        self._in_flight = 0
-        self._pid = os.getpid()
-
-    def _submit(self, trajectories: list[Trajectory]) -> None:
-        assert self._exchange is not None
-        messages = [trajectory.to_wire() for trajectory in trajectories]
-        self._exchange.send(_wire.learner.RecordTrajectoriesRequest(trajectories=messages))
-        self._in_flight += 1
-
-    def _attempt(self) -> None:
-        """Waits for the answers of the present stream, or opens one and sends all that is pending."""
-        if self._exchange is None or not self._exchange.alive or self._pid != os.getpid():
-            self.close()
-            self._transport = connect(self._address, _wire.LEARNER_SERVICE, self._access)
-            self._exchange = self._transport.exchange("RecordTrajectories", timeout=self._timeout)
-            self._submit(list(self.pending.values()))
-        while self._in_flight:
-            answer = self._exchange.receive()
-            self._in_flight -= 1
-            for trajectory_id in answer.trajectory_ids:
-                self.pending.pop(trajectory_id, None)
-        if self.pending:  # an acknowledgement that names other ids: begin anew
-            self.close()
-            raise ServerUnreachableError(
-                f"the learner at {self._address} acknowledged other trajectories than were sent"
-            )

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-import math
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -15,11 +15,15 @@ import numpy.typing as npt
 
 from mazeway import _arrays, _wire
 from mazeway._access import Access
-from mazeway._session import DEFAULT_ADDRESS
+from mazeway._session import DEFAULT_ADDRESS, DEFAULT_TIMEOUT_SECS
 from mazeway._transport import Transport, connect
 from mazeway.env import MazewayEnv
-from mazeway.errors import InvalidArgumentError
+from mazeway.errors import AccessDeniedError, InvalidArgumentError, LimitReachedError, UnsupportedError
 from mazeway.vector import MazewayVectorEnv
+
+#: How long a session may show nothing until the server is asked whether it is there, and how long that
+#: may take.
+_SILENCE_SECS = DEFAULT_TIMEOUT_SECS
 
 #: What pictures may be.
 MODES = ("ansi", "rgb_array", "png")
@@ -70,7 +74,8 @@ def watch(
         max_fps: Pictures a second at most, up to 60; 0 is the environment's own `render_fps`.
         max_width: Pixels across at most, not for "ansi"; 0 is as wide as the environment draws.
         address: "host:port" of the server; None is the environment's own.
-        timeout: Longest wait for a change, in seconds; None waits as long as the session lives.
+        timeout: Longest wait for a change, in seconds. None waits as long as the session lives and the
+            server is there: after a minute without a change it is asked, and has a minute to answer.
         client: As for the environment; None, as for all that follows, is the environment's own.
         token: What the server knows you by.
         ca: File of authorities.
@@ -106,12 +111,23 @@ def watch(
         max_width=max_width,
     )
     transport = connect(address, _wire.ENVIRONMENT_SERVICE, access)
-    return _frames(transport, request, mode, math.inf if timeout is None else timeout)
+    return _frames(transport, request, mode, timeout)
 
 
-def _frames(transport: Transport, request: Any, mode: str, timeout: float) -> Iterator[Frame]:
+def _frames(transport: Transport, request: Any, mode: str, timeout: float | None) -> Iterator[Frame]:
+    def ask() -> None:
+        """Raises where the server does not answer: no pictures may mean that nothing happens."""
+        with contextlib.suppress(AccessDeniedError, LimitReachedError, UnsupportedError):  # answers as well
+            transport.unary("ListEnvironments", _wire.env.ListEnvironmentsRequest(), timeout=_SILENCE_SECS)
+
     try:
-        for answer in transport.responses("Watch", request, timeout=timeout, each=True):
+        for answer in transport.responses(
+            "Watch",
+            request,
+            timeout=_SILENCE_SECS if timeout is None else timeout,
+            each=True,
+            alive=ask if timeout is None else None,
+        ):
             content = answer.content
             if mode == "ansi":
                 content = content.decode()

@@ -1,14 +1,16 @@
 //! The load, a kind a process. Each makes its sessions, says so on a line, and goes on until it is killed.
 
+use crate::acting::{Place, keep};
 use clap::ValueEnum;
-use mazeway_client::{Connection, Env, SessionOptions};
-use mazeway_proto::env::{self as pb, interact_request::Request};
 use std::{
     io::Write as _,
     process::{Child, ChildStdout, Command, Stdio},
     time::Duration,
 };
-use tokio::{task::JoinSet, time::sleep};
+use tokio::{
+    task::{JoinSet, LocalSet},
+    time::sleep,
+};
 
 /// What the sessions of a process do.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -36,10 +38,6 @@ pub struct Share {
     pub lease: Duration,
 }
 
-fn options(lease: Duration) -> SessionOptions {
-    SessionOptions { max_episode_steps: Some(0), lease: Some(lease), ..SessionOptions::default() }
-}
-
 impl Share {
     /// Starts the process and waits until all its sessions are there. `soak` is the program that is part of this crate.
     ///
@@ -63,65 +61,28 @@ impl Share {
     /// Makes the sessions and uses them, for ever.
     pub async fn run(self, address: String) {
         // All are there before the first acts: it would be in the way of the others.
-        let mut envs = Vec::new();
+        let mut all = Vec::new();
         for _ in 0..self.connections {
-            let connection = Connection::open(&address).await.expect("a connection");
+            let place = Place::open(&address, self.lease).await;
             for _ in 0..self.sessions {
-                envs.push(Env::create(&connection, "Maze-v0", options(self.lease)).await.expect("a session"));
+                all.push((place.clone(), place.session().await));
             }
         }
-        let mut tasks = JoinSet::new();
-        for env in envs {
-            match self.kind {
-                Kind::Idle => tasks.spawn(idle(env, self.lease)),
-                Kind::Stepping | Kind::Vanishing => tasks.spawn(stepping(env)),
-                Kind::Silent => tasks.spawn(silent(address.clone(), env)),
-            };
-        }
-        // Let all of them reset.
-        sleep(Duration::from_millis(500)).await;
-        println!("ready");
-        let _ = std::io::stdout().flush();
-        while let Some(task) = tasks.join_next().await {
-            task.expect("load that goes on");
-        }
+        let going_on = async {
+            let mut tasks = JoinSet::new();
+            for (place, env) in all {
+                tasks.spawn_local(keep(self.kind, place, env));
+            }
+            // Let all of them reset.
+            sleep(Duration::from_millis(500)).await;
+            println!("ready");
+            let _ = std::io::stdout().flush();
+            while let Some(task) = tasks.join_next().await {
+                task.expect("load that goes on");
+            }
+        };
+        LocalSet::new().run_until(going_on).await;
     }
-}
-
-async fn idle(mut env: Env, lease: Duration) {
-    env.reset(Some(1)).await.expect("resets");
-    loop {
-        sleep(lease / 3).await;
-        // On a machine that is too busy to let it act in time the lease runs out.
-        if env.step(0).await.is_err() {
-            return;
-        }
-    }
-}
-
-async fn stepping(mut env: Env) {
-    env.reset(Some(1)).await.expect("resets");
-    for action in (0..4).cycle() {
-        // A server that is under load may end what it likes; a session that is lost stays lost.
-        if env.step(action).await.is_err() {
-            return;
-        }
-    }
-}
-
-/// Sends ahead and never reads: on a connection of its own, whose window the unread answers would take from others.
-async fn silent(address: String, env: Env) {
-    let (session_id, channel) =
-        (env.session_id().to_owned(), mazeway_client::channel(&address).await.expect("connects"));
-    let reset = pb::ResetRequest { session_id, ..Default::default() };
-    let step = pb::StepRequest { actions: 1_u32.to_le_bytes().to_vec().into(), ..Default::default() };
-    let steps = std::iter::repeat_with(move || Request::Step(step.clone()));
-    let requests = std::iter::once(Request::Reset(reset)).chain(steps);
-    let requests = tokio_stream::iter(requests.map(|request| pb::InteractRequest { request: Some(request) }));
-    let mut client = pb::environment_service_client::EnvironmentServiceClient::new(channel);
-    let answers = client.interact(requests).await.expect("a stream");
-    std::future::pending::<()>().await;
-    drop((answers, env));
 }
 
 /// A running process of the load, killed when it is dropped.
@@ -142,6 +103,17 @@ impl Process {
         let mut line = String::new();
         std::io::BufReader::new(output).read_line(&mut line)?;
         if line.trim() == "ready" { Ok(()) } else { Err(std::io::Error::other("the load ended before it began")) }
+    }
+
+    /// Looks whether it is still there.
+    ///
+    /// # Errors
+    /// It has ended.
+    pub fn check(&mut self) -> std::io::Result<()> {
+        match self.child.try_wait()? {
+            None => Ok(()),
+            Some(status) => Err(std::io::Error::other(format!("a process of the load has ended: {status}"))),
+        }
     }
 
     /// Stops it where it stands: its connections stay open and say nothing any more.

@@ -1,14 +1,17 @@
 //! `soak`: holds a server under load for as long as one likes, and prints what was seen.
 //!
-//! `cargo run --release -p mazeway-bench-soak -- --minutes 60` builds the server in the same profile first. Linux alone: it
+//! Ends with 1 and a line that says what was missed where it was not what docs/RELIABILITY.md promises. `cargo run --release -p mazeway-bench-soak -- --minutes 60` builds the server in the same profile first. Linux alone: it
 //! looks into `/proc` and runs `chrt`, `taskset` and `kill`.
 
 use clap::{Args, Parser, Subcommand};
+use mazeway_bench_program::{cargo, profile};
 use mazeway_bench_soak::{
+    fits,
     load::{Kind, Share},
+    report::MOST_MEDIANS,
     run::{Plan, run},
 };
-use std::{path::PathBuf, process::ExitCode, time::Duration};
+use std::{io, path::PathBuf, process::ExitCode, time::Duration};
 
 #[derive(Debug, Parser)]
 #[command(about = "Holds a server under the load of two thousand sessions", args_conflicts_with_subcommands = true)]
@@ -27,12 +30,18 @@ struct RunArgs {
     /// The server on the first core, all else on the second: as if on two machines.
     #[arg(long)]
     pinned: bool,
+    /// Instead of the load, a learner on the cores of the server that fits without end: how long steps take beside fits.
+    #[arg(long)]
+    fits: bool,
     /// Print one JSON object instead of tables.
     #[arg(long)]
     json: bool,
     /// The binary `server`; built from the present sources where it is not given.
     #[arg(long, value_name = "FILE")]
     server: Option<PathBuf>,
+    /// The binary `learner`, for `--fits`; likewise.
+    #[arg(long, value_name = "FILE")]
+    learner: Option<PathBuf>,
 }
 
 #[derive(Debug, Subcommand)]
@@ -72,22 +81,51 @@ fn main() -> ExitCode {
         }
         return ExitCode::SUCCESS;
     }
-    let RunArgs { minutes, pinned, json, server } = cli.run;
-    let time = Duration::try_from_secs_f64(minutes * 60.0).unwrap_or(Duration::from_mins(5));
-    let soak = std::env::current_exe().expect("a path of this program");
-    let plan = Plan { server: server.unwrap_or_else(mazeway_bench_program::server), soak, time, pinned };
-    match run(&plan) {
-        Ok(report) => {
-            if json {
-                println!("{}", report.to_json());
-            } else {
-                print!("{}", report.tables());
-            }
-            ExitCode::SUCCESS
+    match cli.run.run() {
+        Ok(missed) if missed.is_empty() => ExitCode::SUCCESS,
+        Ok(missed) => {
+            eprintln!("error: missed: {}", missed.join("; "));
+            ExitCode::FAILURE
         }
         Err(error) => {
             eprintln!("error: {error}");
             ExitCode::FAILURE
         }
     }
+}
+
+impl RunArgs {
+    /// Runs, prints what was seen, and gives what should have been.
+    fn run(self) -> io::Result<Vec<String>> {
+        let Self { minutes, pinned, json, fits, server, learner } = self;
+        let time = Duration::try_from_secs_f64(minutes * 60.0).unwrap_or(Duration::from_mins(5));
+        let server = server.unwrap_or_else(mazeway_bench_program::server);
+        let plan = Plan { server, soak: std::env::current_exe()?, time, pinned };
+        // Where all share all cores, how long one waits is up to the scheduler.
+        let most_medians = if pinned { MOST_MEDIANS } else { f64::INFINITY };
+        let (object, tables, missed) = if fits {
+            let report = fits::run(&plan, &learner.unwrap_or_else(build_learner))?;
+            (report.to_json(), report.tables(), report.missed(most_medians))
+        } else {
+            let report = run(&plan)?;
+            (report.to_json(), report.tables(), report.missed(most_medians))
+        };
+        if json {
+            println!("{object}");
+        } else {
+            print!("{tables}");
+        }
+        Ok(missed)
+    }
+}
+
+/// Builds `learner` beside the present program.
+fn build_learner() -> PathBuf {
+    let own = std::env::current_exe().expect("a path of this program");
+    let directory = own.parent().expect("a profile's directory");
+    let mut cargo = cargo();
+    cargo.args(["build", "--quiet", "-p", "mazeway-learner", "--bin", "learner", "--profile", profile(directory)]);
+    let status = cargo.current_dir(env!("CARGO_MANIFEST_DIR")).status().expect("cargo");
+    assert!(status.success(), "{cargo:?}: {status}");
+    directory.join("learner")
 }

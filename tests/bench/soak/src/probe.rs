@@ -1,6 +1,7 @@
 //! The client that behaves well: it acts now and then, as a person or a slow robot does, and times every step.
 
 use mazeway_client::{Connection, Env, SessionOptions};
+use serde_json::{Value, json};
 use std::{
     io::{self, Write as _},
     time::{Duration, Instant},
@@ -30,6 +31,14 @@ pub struct Waits {
     pub p999: f64,
     /// The slowest.
     pub most: f64,
+}
+
+impl Waits {
+    /// One object for programs.
+    pub fn to_json(&self) -> Value {
+        let Self { steps, median, p99, p999, most } = self;
+        json!({"steps": steps, "median_us": median, "p99_us": p99, "p999_us": p999, "most_us": most})
+    }
 }
 
 /// Acts for a while; `meanwhile` is called every now and then.

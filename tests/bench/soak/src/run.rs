@@ -2,30 +2,33 @@
 
 use crate::{
     load::{Kind, Process, Share},
-    probe::{self, Waits},
+    probe,
+    report::{Crowd, Ends, Report},
     server::{Echo, Server, Taken},
 };
 use rustix::thread::{CpuSet, sched_setaffinity};
-use serde_json::{Value, json};
 use std::{
-    fmt::Write as _,
     io,
     path::PathBuf,
+    thread::sleep,
     time::{Duration, Instant},
 };
 
-/// What the load is, by default: 2,000 sessions on 200 connections.
-const SHARES: [(Kind, usize); 4] = [(Kind::Idle, 100), (Kind::Stepping, 60), (Kind::Silent, 20), (Kind::Vanishing, 20)];
+/// What the load is: 2,000 sessions on 200 connections.
+const SHARES: [(Kind, usize); 4] = [(Kind::Idle, 100), (Kind::Stepping, 60), (Kind::Silent, 20), VANISHING];
+const VANISHING: (Kind, usize) = (Kind::Vanishing, 20);
 /// Sessions of a connection.
 const SESSIONS: usize = 10;
 /// Lease of all sessions of the load.
 const LEASE: Duration = Duration::from_secs(15);
 /// Longest that those who vanish are there.
 const VANISH: Duration = Duration::from_secs(20);
-/// Load before the memory is looked at for the first time: the allocator has then what it keeps.
-const WARM_UP: Duration = Duration::from_secs(3);
-/// Longest that the leases and the connections of the dead may take to end.
+/// How long the loads before and after the long one last.
+const SHORT: Duration = Duration::from_secs(3);
+/// Longest that the load may take to stand, and the leases and the connections of the dead to end.
 const PATIENCE: Duration = Duration::from_mins(1);
+/// Threads for blocking work go after ten idle seconds, and the allocator gives back what is unused meanwhile.
+const REST: Duration = Duration::from_secs(11);
 
 /// What is to be done.
 #[derive(Debug, Clone)]
@@ -40,118 +43,63 @@ pub struct Plan {
     pub pinned: bool,
 }
 
-/// What was seen.
-#[derive(Debug, Clone)]
-pub struct Report {
-    bare: Waits,
-    unloaded: Waits,
-    loaded: Waits,
-    fresh: Taken,
-    before: Taken,
-    peak: Taken,
-    after: Taken,
-    sessions: f64,
-    steps_a_second: f64,
-    busy: f64,
-    load_secs: f64,
-    expired: f64,
-    pinned: bool,
-}
-
-impl Report {
-    /// The p99 of a step under load, in medians of one without.
-    pub fn ratio(&self) -> f64 {
-        self.loaded.p99 / self.unloaded.median
+impl Plan {
+    /// How long the probe looks at a server without load.
+    pub fn quiet(&self) -> Duration {
+        self.time.clamp(Duration::from_secs(2), Duration::from_secs(20))
     }
 
-    /// Bytes that a session of the load takes with its part of a connection.
-    pub fn bytes_a_session(&self) -> f64 {
-        (self.peak.resident - self.fresh.resident) / self.sessions
-    }
-
-    /// Bytes that the second load left behind beyond what the first did.
-    pub fn bytes_left(&self) -> f64 {
-        self.after.resident - self.before.resident
-    }
-
-    /// Files that were open before the load, and after it.
-    pub fn files(&self) -> (usize, usize) {
-        (self.before.files, self.after.files)
-    }
-
-    /// One object for programs.
-    pub fn to_json(&self) -> Value {
-        let waits = |waits: &Waits| {
-            json!({"steps": waits.steps, "median_us": waits.median, "p99_us": waits.p99, "p999_us": waits.p999,
-                   "most_us": waits.most})
-        };
-        let taken = |taken: &Taken| json!({"resident_bytes": taken.resident, "files": taken.files});
-        json!({
-            "benchmark": "soak", "pinned": self.pinned, "load_secs": self.load_secs, "sessions": self.sessions,
-            "bare": waits(&self.bare), "unloaded": waits(&self.unloaded), "loaded": waits(&self.loaded), "ratio": self.ratio(),
-            "steps_a_second": self.steps_a_second, "busy_cores": self.busy, "expired": self.expired,
-            "fresh": taken(&self.fresh), "before": taken(&self.before), "peak": taken(&self.peak),
-            "after": taken(&self.after), "bytes_a_session": self.bytes_a_session(),
-        })
-    }
-
-    /// Tables for people.
-    pub fn tables(&self) -> String {
-        let mut text = String::new();
-        let _ = writeln!(
-            text,
-            "{:<28}{:>10}{:>10}{:>10}{:>10}{:>10}",
-            "step, µs", "steps", "median", "p99", "p99.9", "most"
-        );
-        for (name, waits) in
-            [("bare socket, without load", &self.bare), ("without load", &self.unloaded), ("under load", &self.loaded)]
-        {
-            let Waits { steps, median, p99, p999, most } = waits;
-            let _ = writeln!(text, "{name:<28}{steps:>10}{median:>10.0}{p99:>10.0}{p999:>10.0}{most:>10.0}");
+    /// Has this process, and those that it starts and does not send elsewhere, run on the second core where it is pinned.
+    pub fn take_place(&self) -> io::Result<()> {
+        if self.pinned {
+            let mut second = CpuSet::new();
+            second.set(1);
+            sched_setaffinity(None, &second)?;
         }
-        let _ = writeln!(text, "p99 under load is {:.1} times the median without", self.ratio());
-        let (sessions, steps, busy) = (self.sessions, self.steps_a_second, self.busy);
-        let _ = writeln!(text, "load: {sessions} sessions, {steps:.0} steps a second, {busy:.2} cores of the server");
-        let _ = writeln!(text, "{:<28}{:>14}{:>10}", "server", "resident, MiB", "files");
-        let states =
-            [("fresh", self.fresh), ("after a first load", self.before), ("peak", self.peak), ("after", self.after)];
-        for (name, Taken { resident, files }) in states {
-            let _ = writeln!(text, "{name:<28}{:>14.1}{files:>10}", resident / f64::from(1 << 20));
-        }
-        let _ = writeln!(
-            text,
-            "a session takes {:.1} KiB; {} leases ran out",
-            self.bytes_a_session() / 1024.0,
-            self.expired
-        );
-        text
+        Ok(())
     }
 }
 
 /// The load, with what vanishes and comes anew.
 struct Load<'a> {
     plan: &'a Plan,
-    address: &'a str,
-    _steady: Vec<Process>,
+    server: &'a Server,
+    steady: Vec<Process>,
     vanishing: Process,
     frozen: Vec<Process>,
     since: Instant,
 }
 
 impl<'a> Load<'a> {
-    fn start(plan: &'a Plan, address: &'a str) -> io::Result<Self> {
-        let start =
-            |&(kind, connections): &(Kind, usize)| share(kind, connections).start(&plan.soak, address, plan.pinned);
+    /// Starts it and waits until it stands: all sessions are in use.
+    fn start(plan: &'a Plan, server: &'a Server) -> io::Result<Self> {
+        let start = |&kind: &(Kind, usize)| share(kind).start(&plan.soak, &server.address, plan.pinned);
         let mut all = SHARES.iter().map(start).collect::<io::Result<Vec<_>>>()?;
         for process in &mut all {
             process.ready()?;
         }
+        let wanted = SHARES.iter().map(|(_, connections)| connections * SESSIONS).sum::<usize>() as f64;
+        let begun = Instant::now();
+        loop {
+            let used = server.numbers()?.get("mazeway_server_calls_open")?;
+            if used >= wanted {
+                break;
+            }
+            if begun.elapsed() > PATIENCE {
+                let message = format!("expected {wanted} sessions in use after {PATIENCE:?}, got {used}");
+                return Err(io::Error::other(message));
+            }
+            sleep(Duration::from_millis(100));
+        }
         let vanishing = all.pop().ok_or(io::ErrorKind::InvalidInput)?;
-        Ok(Self { plan, address, _steady: all, vanishing, frozen: Vec::new(), since: Instant::now() })
+        Ok(Self { plan, server, steady: all, vanishing, frozen: Vec::new(), since: Instant::now() })
     }
 
-    /// Those who vanish do, when it is time, and others come in their place.
+    /// Those who vanish do, when it is time, and others come in their place. All others are to be there.
     fn turn(&mut self) -> io::Result<()> {
+        for process in self.steady.iter_mut().chain([&mut self.vanishing]) {
+            process.check()?;
+        }
         if self.since.elapsed() < VANISH {
             return Ok(());
         }
@@ -159,14 +107,13 @@ impl<'a> Load<'a> {
         self.vanishing.freeze()?;
         // Those of the turn before are long gone for the server.
         self.frozen.clear();
-        let (kind, connections) = SHARES[3];
-        let next = share(kind, connections).start(&self.plan.soak, self.address, self.plan.pinned)?;
+        let next = share(VANISHING).start(&self.plan.soak, &self.server.address, self.plan.pinned)?;
         self.frozen.push(std::mem::replace(&mut self.vanishing, next));
         Ok(())
     }
 }
 
-fn share(kind: Kind, connections: usize) -> Share {
+fn share((kind, connections): (Kind, usize)) -> Share {
     Share { kind, connections, sessions: SESSIONS, lease: LEASE }
 }
 
@@ -174,17 +121,30 @@ fn share(kind: Kind, connections: usize) -> Share {
 fn settled(server: &Server) -> io::Result<Taken> {
     let begun = Instant::now();
     loop {
-        let left = (server.number("mazeway_server_sessions")?, server.number("mazeway_server_connections")?);
+        let numbers = server.numbers()?;
+        let left = (numbers.get("mazeway_server_sessions")?, numbers.get("mazeway_server_connections")?);
         if left == (0.0, 0.0) {
-            // Threads for blocking work go after ten idle seconds.
-            std::thread::sleep(Duration::from_secs(11));
+            sleep(REST);
             return server.taken();
         }
         if begun.elapsed() > PATIENCE {
-            return Err(io::Error::other(format!("{left:?} sessions and connections are left after {PATIENCE:?}")));
+            let (sessions, connections) = left;
+            let message = format!(
+                "expected nothing left over {PATIENCE:?} after the load, got {sessions} sessions and {connections} \
+                 connections"
+            );
+            return Err(io::Error::other(message));
         }
-        std::thread::sleep(Duration::from_millis(200));
+        sleep(Duration::from_millis(200));
     }
+}
+
+/// A load of a few seconds, and what the server takes when it has gone.
+fn short(plan: &Plan, server: &Server) -> io::Result<Taken> {
+    let load = Load::start(plan, server)?;
+    sleep(SHORT);
+    drop(load);
+    settled(server)
 }
 
 /// Runs the plan.
@@ -194,34 +154,34 @@ fn settled(server: &Server) -> io::Result<Taken> {
 pub fn run(plan: &Plan) -> io::Result<Report> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
     let server = Server::start(&plan.server, plan.pinned)?;
-    let quiet = plan.time.clamp(Duration::from_secs(2), Duration::from_secs(20));
-    if plan.pinned {
-        let mut second = CpuSet::new();
-        second.set(1);
-        sched_setaffinity(None, &second)?;
-    }
+    plan.take_place()?;
     let bare = {
         let echo = Echo::start(&plan.soak, plan.pinned)?;
-        runtime.block_on(probe::echo(&echo.address, quiet))?
+        runtime.block_on(probe::echo(&echo.address, plan.quiet()))?
     };
-    let unloaded = runtime.block_on(probe::act(&server.address, quiet, || ()));
+    let unloaded = runtime.block_on(probe::act(&server.address, plan.quiet(), || ()));
     let fresh = settled(&server)?;
-    {
-        let _load = Load::start(plan, &server.address)?;
-        std::thread::sleep(WARM_UP);
-    }
-    let before = settled(&server)?;
-    let mut load = Load::start(plan, &server.address)?;
-    let sessions = server.number("mazeway_server_sessions")?;
-    let (begun, steps, processor) =
-        (Instant::now(), server.number("mazeway_server_steps_total")?, server.processor_secs()?);
-    let (mut peak, mut failed) = (server.taken()?, None);
-    let loaded = runtime.block_on(probe::act(&server.address, plan.time, || {
-        let mut look = || {
-            let taken = server.taken()?;
-            peak = Taken { resident: peak.resident.max(taken.resident), files: peak.files.max(taken.files) };
-            load.turn()
+    let first = short(plan, &server)?;
+
+    let mut load = Load::start(plan, &server)?;
+    let begun = Instant::now();
+    let (steps, processor) = (server.numbers()?.get("mazeway_server_steps_total")?, server.processor_secs()?);
+    let (mut peak, mut peak_sessions, mut crowd, mut failed) = (Taken::default(), 0.0, Crowd::default(), None);
+    let mut look = || {
+        let (numbers, taken) = (server.numbers()?, server.taken()?);
+        let sessions = numbers.get("mazeway_server_sessions")?;
+        crowd.add(sessions, numbers.get("mazeway_server_calls_open")?, numbers.get("mazeway_server_connections")?);
+        if taken.resident > peak.resident {
+            peak_sessions = sessions;
+        }
+        peak = Taken {
+            resident: peak.resident.max(taken.resident),
+            own: peak.own.max(taken.own),
+            files: peak.files.max(taken.files),
         };
+        load.turn()
+    };
+    let loaded = runtime.block_on(probe::act(&server.address, plan.time, || {
         if let Err(error) = look() {
             failed.get_or_insert(error);
         }
@@ -229,26 +189,36 @@ pub fn run(plan: &Plan) -> io::Result<Report> {
     if let Some(error) = failed {
         return Err(error);
     }
-    let secs = begun.elapsed().as_secs_f64();
-    let steps_a_second = (server.number("mazeway_server_steps_total")? - steps) / secs;
-    let busy = (server.processor_secs()? - processor) / secs;
+    let load_secs = begun.elapsed().as_secs_f64();
+    let steps_a_second = (server.numbers()?.get("mazeway_server_steps_total")? - steps) / load_secs;
+    let busy = (server.processor_secs()? - processor) / load_secs;
     drop(load);
     let after = settled(&server)?;
-    let expired = server.number("mazeway_server_sessions_expired_total")?;
+    let again = short(plan, &server)?;
+
+    let numbers = server.numbers()?;
+    let ends = Ends {
+        created: numbers.get("mazeway_server_sessions_created_total")?,
+        // The load closes nothing, and each of the two probes what it made.
+        closed: 2.0,
+        expired: numbers.get("mazeway_server_sessions_expired_total")?,
+    };
     let pinned = plan.pinned;
     Ok(Report {
         bare,
         unloaded,
         loaded,
         fresh,
-        before,
+        first,
         peak,
         after,
-        sessions,
+        again,
+        peak_sessions,
+        crowd,
+        ends,
         steps_a_second,
         busy,
-        load_secs: secs,
-        expired,
+        load_secs,
         pinned,
     })
 }

@@ -11,7 +11,10 @@ use super::{
 use bytes::Bytes;
 use parquet::{
     basic::{ConvertedType, Type as PhysicalType},
-    column::reader::{ColumnReader, ColumnReaderImpl},
+    column::{
+        page::{Page, PageMetadata, PageReader},
+        reader::{ColumnReader, ColumnReaderImpl, get_column_reader},
+    },
     data_type::DataType,
     errors::ParquetError,
     file::reader::{ChunkReader, FileReader, Length, SerializedFileReader},
@@ -26,6 +29,10 @@ use std::{
 
 /// Rows that are read at a time.
 const BATCH: usize = 4096;
+/// Bytes of a page at most, once it is unpacked. Writers make them of about a mebibyte.
+const MAX_PAGE_BYTES: u64 = 64 << 20;
+/// Bytes of the beginning of a page's header: two marks and two numbers.
+const HEADER_START: usize = 12;
 const HINT: &str = "write it again with pandas, polars or DuckDB, compressed with snappy, zstd or not at all";
 
 /// A file that says where it ends: reading on there is an error. The library leaves out what it does not know by reading it,
@@ -41,12 +48,94 @@ impl Length for Bounded {
 impl ChunkReader for Bounded {
     type T = Ending<BufReader<File>>;
 
+    /// From the header of a page on.
     fn get_read(&self, start: u64) -> Result<Self::T, ParquetError> {
-        self.0.get_read(start).map(Ending)
+        let mut header = [0; HEADER_START];
+        let read = self.0.get_read(start)?.take(HEADER_START as u64).read(&mut header)?;
+        match page_bytes(&header[..read]) {
+            Some(bytes) if bytes > MAX_PAGE_BYTES => {
+                Err(ParquetError::General(format!("expected pages of {MAX_PAGE_BYTES} bytes at most, got {bytes}")))
+            }
+            _ => self.0.get_read(start).map(Ending),
+        }
     }
 
     fn get_bytes(&self, start: u64, length: usize) -> Result<Bytes, ParquetError> {
         self.0.get_bytes(start, length)
+    }
+}
+
+/// Bytes of a page once it is unpacked, as the beginning of its header says: two numbers in Thrift's compact protocol, each
+/// behind its mark; `None` where it does not begin so, and is then refused elsewhere.
+fn page_bytes(header: &[u8]) -> Option<u64> {
+    let mut bytes = header.iter().copied();
+    let mut number = || {
+        const I32: u8 = 0x15;
+        (bytes.next()? == I32).then_some(())?;
+        let mut number = 0_u64;
+        for shift in (0..35).step_by(7) {
+            let byte = bytes.next()?;
+            number |= u64::from(byte & 0x7f) << shift;
+            if byte < 0x80 {
+                return Some(number);
+            }
+        }
+        None
+    };
+    let (_kind, zigzag) = (number()?, number()?);
+    zigzag.is_multiple_of(2).then_some(zigzag / 2)
+}
+
+/// The pages of a column, where none claims more values than it has bytes for: room is made for them all at once.
+struct Pages {
+    pages: Box<dyn PageReader>,
+    /// Of a value in a dictionary, at least.
+    value_bits: usize,
+}
+
+impl Pages {
+    fn check(&self, page: Page) -> Result<Page, ParquetError> {
+        match page {
+            Page::DictionaryPage { ref buf, num_values, .. }
+                if num_values as usize > buf.len().saturating_mul(8) / self.value_bits =>
+            {
+                let message = format!("a dictionary of {} bytes cannot have {num_values} values", buf.len());
+                Err(ParquetError::General(message))
+            }
+            page => Ok(page),
+        }
+    }
+}
+
+impl Iterator for Pages {
+    type Item = Result<Page, ParquetError>;
+
+    fn next(&mut self) -> Option<Self::Item> {
+        self.get_next_page().transpose()
+    }
+}
+
+impl PageReader for Pages {
+    fn get_next_page(&mut self) -> Result<Option<Page>, ParquetError> {
+        self.pages.get_next_page()?.map(|page| self.check(page)).transpose()
+    }
+
+    fn peek_next_page(&mut self) -> Result<Option<PageMetadata>, ParquetError> {
+        self.pages.peek_next_page()
+    }
+
+    fn skip_next_page(&mut self) -> Result<(), ParquetError> {
+        self.pages.skip_next_page()
+    }
+}
+
+/// Bits of a value of a type, at least.
+fn value_bits(kind: PhysicalType) -> usize {
+    match kind {
+        PhysicalType::BOOLEAN | PhysicalType::FIXED_LEN_BYTE_ARRAY => 1,
+        PhysicalType::INT32 | PhysicalType::FLOAT | PhysicalType::BYTE_ARRAY => 32,
+        PhysicalType::INT64 | PhysicalType::DOUBLE => 64,
+        PhysicalType::INT96 => 96,
     }
 }
 
@@ -158,7 +247,13 @@ impl ParquetTable {
             (self.open, self.left) = guarded(&self.file, &place, || {
                 let group = reader.get_row_group(group)?;
                 let rows = usize::try_from(group.metadata().num_rows()).unwrap_or(0);
-                let columns = leaves.iter().map(|&leaf| group.get_column_reader(leaf)).collect::<Result<_, _>>()?;
+                let column = |&leaf: &usize| {
+                    let description = group.metadata().schema_descr().column(leaf);
+                    let (pages, value_bits) =
+                        (group.get_column_page_reader(leaf)?, value_bits(description.physical_type()));
+                    Ok(get_column_reader(description, Box::new(Pages { pages, value_bits })))
+                };
+                let columns = leaves.iter().map(column).collect::<Result<_, ParquetError>>()?;
                 Ok((columns, rows))
             })?;
         }
@@ -267,4 +362,19 @@ fn typed<T: DataType>(
         }
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_page_says_how_large_it_is() {
+        // A data page of 2,147,483,647 bytes: zigzag 4,294,967,294.
+        assert_eq!(page_bytes(&[0x15, 0, 0x15, 0xfe, 0xff, 0xff, 0xff, 0x0f, 0x15]), Some(i32::MAX as u64));
+        assert_eq!(page_bytes(&[0x15, 4, 0x15, 32]), Some(16));
+        for other in [&[0x15, 4, 0x15, 1][..], &[0x15, 4, 0x25, 32], &[0x15, 4, 0x15], &[0x15; 1], &[]] {
+            assert_eq!(page_bytes(other), None, "{other:?}");
+        }
+    }
 }

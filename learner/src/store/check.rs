@@ -30,6 +30,8 @@ const MAX_NAMED: usize = 10_000;
 const MAX_TRIED: u32 = 1 << 20;
 /// Keys beyond the last known one that are tried.
 const BEYOND: i64 = 10_000;
+/// After so many in vain, one more is left out at a time.
+const STRIDE: u32 = 16;
 
 /// How many of a kind were looked at.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize)]
@@ -294,26 +296,64 @@ impl<'a> Keys<'a> {
             return known.into_iter().try_for_each(visit);
         };
         let mut known = known.into_iter().peekable();
-        let mut left = MAX_TRIED;
-        while at <= last && left > 0 {
+        let mut vain = Vain { left: MAX_TRIED, in_a_row: 0, step: 1, careful: false };
+        while at <= last && vain.left > 0 {
             let next = match statement.query_row([at], |row| row.get::<_, i64>(0)) {
-                Ok(next) if next >= at => Some(next),
+                Ok(next) if next >= at => next,
                 Err(rusqlite::Error::QueryReturnedNoRows) => break,
-                _ => None,
+                _ => {
+                    if known.next_if_eq(&at).is_some() {
+                        visit(at)?;
+                    }
+                    let further = at.saturating_add(vain.next());
+                    at = known.peek().map_or(further, |known| further.min(*known));
+                    continue;
+                }
             };
-            left -= u32::from(next.is_none());
-            let reached = next.unwrap_or(at);
-            while let Some(missing) = known.next_if(|known| *known < reached) {
+            if let Some(back) = vain.ends() {
+                at -= back;
+                continue;
+            }
+            while let Some(missing) = known.next_if(|known| *known < next) {
                 visit(missing)?;
             }
-            let is_known = known.next_if_eq(&reached).is_some();
-            if is_known || next.is_some() {
-                visit(reached)?;
-            }
-            let Some(after) = reached.checked_add(1) else { break };
+            known.next_if_eq(&next);
+            visit(next)?;
+            let Some(after) = next.checked_add(1) else { break };
             at = after;
         }
         known.try_for_each(visit)
+    }
+}
+
+/// Keys that are tried in vain, one after the other.
+struct Vain {
+    /// How many more may be.
+    left: u32,
+    in_a_row: u32,
+    /// From the last one to the next.
+    step: i64,
+    /// Every key is tried, whatever is known.
+    careful: bool,
+}
+
+impl Vain {
+    /// One more was; how far it is to the next: further and further, so that the way is short even to a key that damage has
+    /// put far away. Pages that read between two that do not are met unless they hold less than a sixteenth of what lies before.
+    fn next(&mut self) -> i64 {
+        self.left -= 1;
+        self.in_a_row += 1;
+        self.step = if self.careful { 1 } else { 1 + i64::from(self.in_a_row / STRIDE) };
+        self.step
+    }
+
+    /// One was not in vain: how far to go back for what was left out before it, which is then tried key by key.
+    fn ends(&mut self) -> Option<i64> {
+        let left_out = self.step - 1;
+        self.in_a_row = 0;
+        self.step = 1;
+        self.careful = left_out > 0;
+        self.careful.then_some(left_out)
     }
 }
 

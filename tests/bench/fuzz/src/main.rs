@@ -21,7 +21,7 @@ use std::{
     io,
     path::{Path, PathBuf},
     process::{Command, ExitCode},
-    time::Instant,
+    time::{Duration, Instant},
 };
 
 /// Tells a child its target.
@@ -96,7 +96,7 @@ fn main() -> ExitCode {
 
 /// In a child: what libFuzzer makes is read.
 fn read_inputs(target: &'static Target) {
-    check!().with_max_len(target.max_bytes).for_each(|input| {
+    check!().with_max_len(target.max_bytes).with_shrink_time(Duration::ZERO).for_each(|input| {
         let begun = Instant::now();
         let peak = allocation_counter::measure(|| drop((target.read)(input))).bytes_max;
         if let Some(failure) = judge(peak, begun.elapsed()) {

@@ -22,8 +22,10 @@ use opentelemetry_proto::tonic::{
 };
 use std::{
     collections::BTreeSet,
+    fs,
     io::{BufRead as _, BufReader, Read as _, Write as _},
     net::TcpStream,
+    path::Path,
     process::{Child, Command, Stdio},
     sync::{Arc, Mutex},
     time::{Duration, Instant},
@@ -143,6 +145,29 @@ fn request_id(status: &Status) -> String {
     status.get_details_request_info().expect("the request's name among the details").request_id
 }
 
+/// Names of one service's numbers in a text, without what a histogram adds to them.
+fn names(text: &str, service: &str) -> BTreeSet<String> {
+    let words = text.split(|c: char| !c.is_ascii_alphanumeric() && c != '_').filter(|word| word.starts_with(service));
+    let ends = ["_bucket", "_count", "_sum"];
+    // A name that ends in a line is the beginning of several.
+    words
+        .filter(|word| !word.ends_with('_'))
+        .map(|word| ends.iter().find_map(|end| word.strip_suffix(end)).unwrap_or(word).to_owned())
+        .collect()
+}
+
+/// What operators are told to look at is there.
+fn what_the_documents_name_is_served(service: &str, shown: &Shown) {
+    let served = names(&shown.get("/metrics").1, service);
+    for document in ["alerts.yml", "OPERATIONS.md"] {
+        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join("docs").join(document);
+        let text = fs::read_to_string(path).expect("a document").replace("mazeway_(server|learner)_", service);
+        let asked = names(&text, service);
+        let unknown = asked.difference(&served).collect::<Vec<_>>();
+        assert!(asked.len() > 4 && unknown.is_empty(), "{document}: {unknown:?}");
+    }
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn a_server_counts_what_it_does() {
     let server = Shown::server(&["--max-sessions", "2"]);
@@ -188,6 +213,7 @@ async fn a_server_counts_what_it_does() {
     assert!(server.number("mazeway_server_sent_bytes_total") > 100.0 * 9.0);
     env.close().await.expect("closes");
     assert_eq!(server.number("mazeway_server_sessions"), 1.0);
+    what_the_documents_name_is_served("mazeway_server_", &server);
     // A method that there is not makes no label.
     let mut client = tonic::client::Grpc::new(mazeway_client::channel(&server.address).await.expect("connects"));
     for number in 0..50 {
@@ -315,6 +341,7 @@ async fn a_learner_counts_what_it_stores_and_fits() {
     }
     assert!(service.number("mazeway_learner_commit_seconds_count") >= 2.0);
     assert!(service.number("mazeway_learner_store_bytes") > bytes as f64);
+    what_the_documents_name_is_served("mazeway_learner_", &service);
 }
 
 #[tokio::test(flavor = "multi_thread")]

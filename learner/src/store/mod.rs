@@ -107,9 +107,8 @@ impl Store {
         let activity = Arc::new(Activity::default());
         let writer = Writer::start(connection, path.clone(), Arc::clone(&activity))?;
         let pending = Arc::new(Semaphore::new(PENDING_BYTES / PENDING_UNIT));
-        let readers = Mutex::default();
-        let (_room, _user) = (Room::kept(directory), user);
-        Ok(Self(Arc::new(Inner { path, options, readers, writer, activity, pending, _room, _user })))
+        let (readers, room) = (Mutex::default(), Room::kept(directory));
+        Ok(Self(Arc::new(Inner { path, options, readers, writer, activity, pending, _room: room, _user: user })))
     }
 
     /// As [`Store::open`], where there is a store already. Blocks.

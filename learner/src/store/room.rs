@@ -58,7 +58,7 @@ fn keep(directory: &Path) {
     let path = directory.join(FILE);
     let kept = fs::metadata(&path).is_ok_and(|file| file.len() == BYTES as u64);
     // Not zeros, which some file systems do not store.
-    if !kept && let Err(error) = fs::write(&path, [b'.'; BYTES]) {
+    if !kept && let Err(error) = fs::write(&path, vec![b'.'; BYTES]) {
         if error.kind() != io::ErrorKind::NotFound {
             tracing::debug!(%error, "no room could be kept for reading");
         }

@@ -35,7 +35,7 @@ impl Caller {
         request.extensions().get::<Self>().cloned().unwrap_or_else(Self::anybody)
     }
 
-    /// Its name in logs, metrics and queues; empty for anybody.
+    /// Its name in logs, spans and queues; empty for anybody.
     pub fn name(&self) -> &str {
         &self.0.name
     }

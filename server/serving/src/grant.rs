@@ -68,7 +68,7 @@ pub struct Quotas {
 /// What a token, or a certificate, entitles to.
 #[derive(Debug)]
 pub struct Grant {
-    /// Whose it is: in logs, metrics, queues and for what it owns.
+    /// Whose it is: in logs, spans, queues and for what it owns.
     pub name: String,
     /// What it is good for.
     pub scopes: Vec<Scope>,

@@ -3,7 +3,7 @@
 //! A token is 256 random bits, so its hash is stored under plain SHA-256: slow hashes make passwords expensive to guess,
 //! and there is nothing to guess here, while every call would pay for the slowness. Invariants: no two tokens share a name
 //! or a hash; the secret itself is nowhere but in the hands of its holder. Names are short and plain, for they go into
-//! logs, metrics and the store.
+//! logs, spans and the store.
 
 use crate::grant::{Grant, Quotas, Scope};
 use base64::{Engine as _, prelude::BASE64_URL_SAFE_NO_PAD};

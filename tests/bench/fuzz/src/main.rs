@@ -165,9 +165,10 @@ fn fuzz(target: &Target, runs: u64, seed: u32, work: &Path) -> Result<Outcome, S
 
 /// Pieces of a format as libFuzzer reads them.
 fn dictionary(words: &[&[u8]]) -> String {
-    let quoted = |word: &&[u8]| {
-        let bytes = word.iter().map(|byte| format!("\\x{byte:02x}")).collect::<String>();
-        format!("\"{bytes}\"\n")
-    };
-    words.iter().map(quoted).collect()
+    let mut text = String::new();
+    for word in words {
+        let escaped = word.iter().flat_map(|byte| ["\\x".to_owned(), format!("{byte:02x}")]);
+        text.extend(["\"".to_owned()].into_iter().chain(escaped).chain(["\"\n".to_owned()]));
+    }
+    text
 }

@@ -9,6 +9,7 @@ mod csv;
 mod demonstrations;
 mod error;
 mod export;
+mod footer;
 mod json_lines;
 mod model;
 mod model_json;

@@ -5,12 +5,13 @@
 
 use super::{
     error::{FileError, Place},
+    footer::{is_plausible, varint},
     table::Table,
     value::Value,
 };
 use bytes::Bytes;
 use parquet::{
-    basic::{ConvertedType, Type as PhysicalType},
+    basic::{ConvertedType, Encoding, Type as PhysicalType},
     column::{
         page::{Page, PageMetadata, PageReader},
         reader::{ColumnReader, ColumnReaderImpl, get_column_reader},
@@ -31,6 +32,8 @@ use std::{
 const BATCH: usize = 4096;
 /// Bytes of a page at most, once it is unpacked. Writers make them of about a mebibyte.
 const MAX_PAGE_BYTES: u64 = 64 << 20;
+/// What a file ends with.
+const MAGIC: &[u8; 4] = b"PAR1";
 /// Bytes of the beginning of a page's header: two marks and two numbers.
 const HEADER_START: usize = 12;
 const HINT: &str = "write it again with pandas, polars or DuckDB, compressed with snappy, zstd or not at all";
@@ -38,6 +41,19 @@ const HINT: &str = "write it again with pandas, polars or DuckDB, compressed wit
 /// A file that says where it ends: reading on there is an error. The library leaves out what it does not know by reading it,
 /// takes an end for bytes that were read, and would go on for billions of them where a damaged header says so.
 struct Bounded(File);
+
+impl Bounded {
+    /// The footer: before the last eight bytes, which tell its length; `None` where there is none.
+    fn footer(&self) -> Result<Option<Bytes>, ParquetError> {
+        let Some(end) = Length::len(self).checked_sub(8) else { return Ok(None) };
+        let tail = self.get_bytes(end, 8)?;
+        let length = u32::from_le_bytes([tail[0], tail[1], tail[2], tail[3]]);
+        match end.checked_sub(length.into()) {
+            Some(start) if tail[4..] == *MAGIC => self.get_bytes(start, length as usize).map(Some),
+            _ => Ok(None),
+        }
+    }
+}
 
 impl Length for Bounded {
     fn len(&self) -> u64 {
@@ -71,39 +87,60 @@ fn page_bytes(header: &[u8]) -> Option<u64> {
     let mut bytes = header.iter().copied();
     let mut number = || {
         const I32: u8 = 0x15;
-        (bytes.next()? == I32).then_some(())?;
-        let mut number = 0_u64;
-        for shift in (0..35).step_by(7) {
-            let byte = bytes.next()?;
-            number |= u64::from(byte & 0x7f) << shift;
-            if byte < 0x80 {
-                return Some(number);
-            }
-        }
-        None
+        (bytes.next()? == I32).then(|| varint(|| bytes.next()))?
     };
     let (_kind, zigzag) = (number()?, number()?);
     zigzag.is_multiple_of(2).then_some(zigzag / 2)
 }
 
-/// The pages of a column, where none claims more values than it has bytes for: room is made for them all at once.
+/// The pages of a column, where none claims more values than it can have: the library makes room for them all at once, and a
+/// process that cannot have so much room ends.
 struct Pages {
     pages: Box<dyn PageReader>,
     /// Of a value in a dictionary, at least.
     value_bits: usize,
+    /// Whether values may be missing, so that a page begins with which.
+    optional: bool,
 }
 
 impl Pages {
     fn check(&self, page: Page) -> Result<Page, ParquetError> {
-        match page {
-            Page::DictionaryPage { ref buf, num_values, .. }
-                if num_values as usize > buf.len().saturating_mul(8) / self.value_bits =>
+        let refuse = |message: String| Err(ParquetError::General(message));
+        match &page {
+            Page::DictionaryPage { buf, num_values, .. }
+                if *num_values as usize > buf.len().saturating_mul(8) / self.value_bits =>
             {
-                let message = format!("a dictionary of {} bytes cannot have {num_values} values", buf.len());
-                Err(ParquetError::General(message))
+                refuse(format!("a dictionary of {} bytes cannot have {num_values} values", buf.len()))
             }
-            page => Ok(page),
+            Page::DataPage { encoding: Encoding::DELTA_BYTE_ARRAY, .. }
+            | Page::DataPageV2 { encoding: Encoding::DELTA_BYTE_ARRAY, .. } => {
+                refuse("expected texts that are plain, in a dictionary or behind their lengths, got prefixes".into())
+            }
+            Page::DataPage { encoding: Encoding::DELTA_LENGTH_BYTE_ARRAY, .. }
+            | Page::DataPageV2 { encoding: Encoding::DELTA_LENGTH_BYTE_ARRAY, .. } => {
+                let (claimed, values) = (self.lengths(&page), page.num_values());
+                if claimed.is_none_or(|claimed| claimed > u64::from(values)) {
+                    return refuse(format!("a page of {values} values cannot have {claimed:?} lengths"));
+                }
+                Ok(page)
+            }
+            _ => Ok(page),
         }
+    }
+
+    /// How many lengths a page says that it has: the third number of its values.
+    fn lengths(&self, page: &Page) -> Option<u64> {
+        let (bytes, levels) = match page {
+            // Their length in four bytes, then which values are missing.
+            Page::DataPage { buf, .. } if self.optional => (buf, 4 + u32::from_le_bytes(*buf.first_chunk()?) as usize),
+            Page::DataPage { buf, .. } => (buf, 0),
+            Page::DataPageV2 { buf, def_levels_byte_len, rep_levels_byte_len, .. } => {
+                (buf, *def_levels_byte_len as usize + *rep_levels_byte_len as usize)
+            }
+            Page::DictionaryPage { .. } => return None,
+        };
+        let mut bytes = bytes.get(levels..)?.iter().copied();
+        (0..3).map(|_| varint(|| bytes.next())).last()?
     }
 }
 
@@ -198,7 +235,13 @@ impl ParquetTable {
     /// It cannot be read, or is none.
     pub fn open(file: &Path) -> Result<Self, FileError> {
         let opened = File::open(file).map_err(|error| FileError::unreadable(file, &error))?;
-        let reader = guarded(file, &Place::File, || SerializedFileReader::new(Bounded(opened)))?;
+        let reader = guarded(file, &Place::File, || {
+            let bounded = Bounded(opened);
+            if bounded.footer()?.is_some_and(|footer| !is_plausible(&footer)) {
+                return Err(ParquetError::General("its footer is damaged".into()));
+            }
+            SerializedFileReader::new(bounded)
+        })?;
         let schema = reader.metadata().file_metadata().schema_descr_ptr();
         let (mut columns, mut leaves, mut unsigned) = (Vec::new(), Vec::new(), Vec::new());
         for leaf in 0..schema.num_columns() {
@@ -249,9 +292,12 @@ impl ParquetTable {
                 let rows = usize::try_from(group.metadata().num_rows()).unwrap_or(0);
                 let column = |&leaf: &usize| {
                     let description = group.metadata().schema_descr().column(leaf);
-                    let (pages, value_bits) =
-                        (group.get_column_page_reader(leaf)?, value_bits(description.physical_type()));
-                    Ok(get_column_reader(description, Box::new(Pages { pages, value_bits })))
+                    let pages = Pages {
+                        pages: group.get_column_page_reader(leaf)?,
+                        value_bits: value_bits(description.physical_type()),
+                        optional: description.max_def_level() > 0,
+                    };
+                    Ok(get_column_reader(description, Box::new(pages)))
                 };
                 let columns = leaves.iter().map(column).collect::<Result<_, ParquetError>>()?;
                 Ok((columns, rows))

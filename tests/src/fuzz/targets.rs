@@ -352,7 +352,7 @@ fn model_message(bytes: &[u8]) -> Result<String, String> {
     Ok("a model".into())
 }
 
-/// A database: checked, opened, read in every way, repaired.
+/// A database: checked, opened, read in every way; one in sixteen is repaired, which takes longer than all else.
 fn store_file(bytes: &[u8]) -> Result<String, String> {
     let directory = directory().join("store");
     let _ = fs::remove_dir_all(&directory);
@@ -365,8 +365,10 @@ fn store_file(bytes: &[u8]) -> Result<String, String> {
         read.map_err(text)?;
         return Ok("sound".into());
     }
-    let repaired = store::repair(&directory).map_err(text)?;
-    assert!(repaired.kept.is_none() || store::verify(&directory).is_ok_and(|found| found.is_sound()));
+    if bytes.iter().fold(0_u8, |sum, byte| sum.wrapping_add(*byte)).is_multiple_of(16) {
+        let repaired = store::repair(&directory).map_err(text)?;
+        assert!(repaired.kept.is_none() || store::verify(&directory).is_ok_and(|found| found.is_sound()));
+    }
     let why = found.damage.first().map(|damage| damage.message.clone()).or(found.structure.first().cloned());
     Err(why.unwrap_or_default())
 }

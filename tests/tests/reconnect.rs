@@ -15,6 +15,7 @@ use std::{
     io::{BufRead as _, BufReader, Read as _, Write as _},
     net::TcpStream,
     process::{Command, Stdio},
+    thread,
     time::{Duration, Instant},
 };
 use tokio::{net::TcpListener, time::sleep};
@@ -65,8 +66,8 @@ async fn a_server_that_comes_back_is_waited_for_and_one_that_does_not_is_an_erro
     let address = server.socket();
     let connection = Connection::open(&address.to_string()).await.expect("a server");
     server.stop();
-    let again = std::thread::spawn(move || {
-        std::thread::sleep(Duration::from_millis(700));
+    let again = thread::spawn(move || {
+        thread::sleep(Duration::from_millis(700));
         EnvServer::at(address, config())
     });
     assert!(!connection.list_environments().await.expect("lists").is_empty());
@@ -96,6 +97,12 @@ struct Frozen<'a>(&'a Service);
 impl<'a> Frozen<'a> {
     fn new(service: &'a Service) -> Self {
         signal(service, "-STOP");
+        // The signal is on its way when it has been sent; where the system does not say when it is there, it has time.
+        let stat = format!("/proc/{}/stat", service.pid());
+        while std::fs::read_to_string(&stat).is_ok_and(|stat| !stat.contains(") T ")) {
+            thread::sleep(Duration::from_millis(1));
+        }
+        thread::sleep(Duration::from_millis(50));
         Self(service)
     }
 }

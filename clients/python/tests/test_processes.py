@@ -267,7 +267,15 @@ def test_an_expired_lease_is_said_and_mended(own_server):
     env.close()
 
 
-def test_an_interrupted_step_asks_for_a_reset(own_server):
+@pytest.fixture
+def interruptible():
+    """Ctrl-C raises, also where a shell started the tests in the background and so had them ignore it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def test_an_interrupted_step_asks_for_a_reset(own_server, interruptible):
     env = mazeway.MazewayEnv("Maze-v0", own_server.address)
     env.reset(seed=1)
     own_server.pause()

@@ -72,6 +72,9 @@ impl Peers {
         let create = env::CreateSessionRequest { env_id: "Maze-v0".into(), num_envs: 2, lease, ..Default::default() };
         let made = peers.ask(&format!("{ENVIRONMENTS}CreateSession"), vec![create.encode_to_vec()]).expect("a session");
         peers.session = env::CreateSessionResponse::decode(made[0].clone()).expect("a session").session_id;
+        // Who watches one that has not begun waits for it.
+        let reset = env::ResetRequest { session_id: peers.session.clone(), ..Default::default() };
+        peers.ask(&format!("{ENVIRONMENTS}Reset"), vec![reset.encode_to_vec()]).expect("it begins");
         let text = |text: &str| dm_env::Tensor {
             payload: Some(dm_env::tensor::Payload::Strings(dm_env::tensor::StringArray { array: vec![text.into()] })),
             ..Default::default()

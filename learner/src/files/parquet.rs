@@ -32,6 +32,8 @@ use std::{
 const BATCH: usize = 4096;
 /// Bytes of a page at most, once it is unpacked. Writers make them of about a mebibyte.
 const MAX_PAGE_BYTES: u64 = 64 << 20;
+/// Bytes behind the footer: its length and what follows.
+const TAIL: u64 = 8;
 /// What a file ends with.
 const MAGIC: &[u8; 4] = b"PAR1";
 /// Bytes of the beginning of a page's header: two marks and two numbers.
@@ -43,10 +45,10 @@ const HINT: &str = "write it again with pandas, polars or DuckDB, compressed wit
 struct Bounded(File);
 
 impl Bounded {
-    /// The footer: before the last eight bytes, which tell its length; `None` where there is none.
+    /// The footer: before the last bytes, which tell its length; `None` where there is none.
     fn footer(&self) -> Result<Option<Bytes>, ParquetError> {
-        let Some(end) = Length::len(self).checked_sub(8) else { return Ok(None) };
-        let tail = self.get_bytes(end, 8)?;
+        let Some(end) = Length::len(self).checked_sub(TAIL) else { return Ok(None) };
+        let tail = self.get_bytes(end, TAIL as usize)?;
         let length = u32::from_le_bytes([tail[0], tail[1], tail[2], tail[3]]);
         match end.checked_sub(length.into()) {
             Some(start) if tail[4..] == *MAGIC => self.get_bytes(start, length as usize).map(Some),
@@ -64,15 +66,19 @@ impl Length for Bounded {
 impl ChunkReader for Bounded {
     type T = Ending<BufReader<File>>;
 
-    /// From the header of a page on.
+    /// From the header of a page on, or the file's last bytes.
     fn get_read(&self, start: u64) -> Result<Self::T, ParquetError> {
+        if start.saturating_add(TAIL) >= Length::len(self) {
+            return self.0.get_read(start).map(Ending);
+        }
         let mut header = [0; HEADER_START];
         let read = self.0.get_read(start)?.take(HEADER_START as u64).read(&mut header)?;
         match page_bytes(&header[..read]) {
+            None => Err(ParquetError::General("the header of a page is damaged".into())),
             Some(bytes) if bytes > MAX_PAGE_BYTES => {
                 Err(ParquetError::General(format!("expected pages of {MAX_PAGE_BYTES} bytes at most, got {bytes}")))
             }
-            _ => self.0.get_read(start).map(Ending),
+            Some(_) => self.0.get_read(start).map(Ending),
         }
     }
 
@@ -82,7 +88,7 @@ impl ChunkReader for Bounded {
 }
 
 /// Bytes of a page once it is unpacked, as the beginning of its header says: two numbers in Thrift's compact protocol, each
-/// behind its mark; `None` where it does not begin so, and is then refused elsewhere.
+/// behind its mark, as every writer begins; `None` where it does not begin so.
 fn page_bytes(header: &[u8]) -> Option<u64> {
     let mut bytes = header.iter().copied();
     let mut number = || {

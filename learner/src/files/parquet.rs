@@ -102,7 +102,7 @@ fn page_bytes(header: &[u8]) -> Option<u64> {
 /// The pages of a column, where none claims more values than it can have: the library makes room for them all at once, and a
 /// process that cannot have so much room ends.
 struct Pages {
-    pages: Box<dyn PageReader>,
+    inner: Box<dyn PageReader>,
     /// Of a value in a dictionary, at least.
     value_bits: usize,
     /// Whether values may be missing, so that a page begins with which.
@@ -160,15 +160,15 @@ impl Iterator for Pages {
 
 impl PageReader for Pages {
     fn get_next_page(&mut self) -> Result<Option<Page>, ParquetError> {
-        self.pages.get_next_page()?.map(|page| self.check(page)).transpose()
+        self.inner.get_next_page()?.map(|page| self.check(page)).transpose()
     }
 
     fn peek_next_page(&mut self) -> Result<Option<PageMetadata>, ParquetError> {
-        self.pages.peek_next_page()
+        self.inner.peek_next_page()
     }
 
     fn skip_next_page(&mut self) -> Result<(), ParquetError> {
-        self.pages.skip_next_page()
+        self.inner.skip_next_page()
     }
 }
 
@@ -299,7 +299,7 @@ impl ParquetTable {
                 let column = |&leaf: &usize| {
                     let description = group.metadata().schema_descr().column(leaf);
                     let pages = Pages {
-                        pages: group.get_column_page_reader(leaf)?,
+                        inner: group.get_column_page_reader(leaf)?,
                         value_bits: value_bits(description.physical_type()),
                         optional: description.max_def_level() > 0,
                     };

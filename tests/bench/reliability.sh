@@ -1,9 +1,10 @@
 #!/usr/bin/env bash
-# The long runs behind docs/RELIABILITY.md: tests/bench/reliability.sh cuts|kills|damage|fuzz [N]
+# The long runs behind docs/RELIABILITY.md: tests/bench/reliability.sh cuts|kills|damage|fuzz|soak [N]
 #   cuts N     cuts of the power (default 1000000)
 #   kills N    kill -9 of the service under a recording load (default 200)
 #   damage N   damaged files (default 10000)
 #   fuzz N     inputs of every target (default 10000000); TARGETS="NAME ..." chooses, SEED=N varies them
+#   soak N     minutes under the load of 2,000 sessions (default 60), the server on a core of its own
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 test() { cargo test --release --locked -p mazeway-tests --test "$1" "$2" -- --nocapture; }
@@ -20,8 +21,9 @@ case "${1:-}" in
         # shellcheck disable=SC2086
         "$CARGO_TARGET_DIR/$host/fuzz/fuzz" --runs "${2:-10000000}" --seed "${SEED:-1}" ${TARGETS:-}
         ;;
+    soak) cargo run --release --locked -p mazeway-bench-soak -- --minutes "${2:-60}" --pinned ;;
     *)
-        sed -n '2,6s/^# //p' "$0" >&2
+        sed -n '2,7s/^# //p' "$0" >&2
         exit 2
         ;;
 esac

@@ -21,7 +21,7 @@ fn whatever_the_bytes_are_reading_them_ends_well() {
     let outcome = std::panic::catch_unwind(|| {
         TARGETS.par_iter().for_each(|target| {
             let meter = |work: &mut dyn FnMut()| allocation_counter::measure(work).bytes_max;
-            let tally = run(target, executions(target), 1, meter, |_, _| ());
+            let tally = run(target, executions(target), 1, meter);
             assert!(tally.accepted > 0 && tally.answers > 3, "{}: {tally:?}", target.name);
         });
     });

@@ -1,6 +1,6 @@
 //! `learner export` and `learner delete`: whole trajectories out of the store.
 
-use super::{StoreArgs, connect::connect, data_directory, error::CliError, models};
+use super::{StoreArgs, connect::connect, data_directory, error::CliError, maintain::NAMED, models};
 use clap::{Args, ValueEnum};
 use mazeway_client::{ClientError, Code, Learner, packed::Packed};
 use mazeway_learner::{
@@ -16,9 +16,6 @@ use std::{
     path::PathBuf,
 };
 use tokio::task::spawn_blocking;
-
-/// Damaged trajectories that are named at most.
-const NAMED: usize = 50;
 
 /// Which trajectories.
 #[derive(Debug, Args)]

@@ -13,7 +13,7 @@ use std::{
 use tokio::task::spawn_blocking;
 
 /// Things that are named on a terminal at most.
-const NAMED: usize = 50;
+pub const NAMED: usize = 50;
 
 /// Which directory, and how it is told.
 #[derive(Debug, Args)]

@@ -15,7 +15,7 @@ import time
 import weakref
 from collections.abc import Callable, Iterable, Iterator
 from queue import SimpleQueue
-from typing import Any, TypeVar
+from typing import Any
 
 import grpc
 
@@ -23,15 +23,12 @@ from mazeway import _wire
 from mazeway._access import Credentials
 from mazeway._transport import (
     MAX_MESSAGE_BYTES,
-    REPEATABLE,
     START,
     Exchange,
     late,
-    reconnecting,
+    repeated,
 )
 from mazeway.errors import MazewayError, ServerFailureError, ServerUnreachableError, from_status
-
-T = TypeVar("T")
 
 #: How long a fork waits for a call that another thread is making.
 _FORK_WAIT_SECS = 5.0
@@ -96,7 +93,7 @@ class GrpcTransport:
             with self._translated(timeout), self._lock:
                 return self._callable(method)(request, timeout=left)
 
-        return self._repeated(method, call, timeout)
+        return repeated(self, method, call, timeout)
 
     def responses(
         self,
@@ -124,7 +121,7 @@ class GrpcTransport:
                 return stack.pop_all(), answers, answer
 
         # Until the first answer the call may be made anew.
-        stack, answers, answer = self._repeated(method, begin, timeout)
+        stack, answers, answer = repeated(self, method, begin, timeout)
         with stack:
             while answer is not None:
                 yield answer
@@ -140,14 +137,7 @@ class GrpcTransport:
                     made = self._callable(method)
                 return made(iter(messages), timeout=left)
 
-        return self._repeated(method, call, timeout)
-
-    def _repeated(self, method: str, call: Callable[[float], T], timeout: float) -> T:
-        """Calls, again where that is harmless and a server that was there has gone."""
-        repeat = self.known and method in REPEATABLE
-        answer = reconnecting(call, timeout) if repeat else call(timeout)
-        self.known = True
-        return answer
+        return repeated(self, method, call, timeout)
 
     def exchange(self, method: str, *, timeout: float) -> Exchange:
         """See `Transport`."""

@@ -11,14 +11,12 @@ import contextlib
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator
-from typing import Any, TypeVar
+from typing import Any
 
 from mazeway import _native, _wire
 from mazeway._access import Credentials
-from mazeway._transport import REPEATABLE, START, Exchange, late, reconnecting
+from mazeway._transport import START, Exchange, late, repeated
 from mazeway.errors import MazewayError, ServerFailureError, from_status
-
-T = TypeVar("T")
 
 _keeper: tuple[int, _native.Keeper] | None = None
 
@@ -61,7 +59,7 @@ class NativeTransport:
             with self.translated(timeout):
                 return self.channel().unary(called.path, request.SerializeToString(), left)
 
-        return called.response.FromString(self._repeated(method, call, timeout))
+        return called.response.FromString(repeated(self, method, call, timeout))
 
     def responses(
         self,
@@ -98,7 +96,7 @@ class NativeTransport:
                 alive()
 
         # Until the first answer the call may be made anew.
-        answers, answer = self._repeated(method, begin, timeout)
+        answers, answer = repeated(self, method, begin, timeout)
         try:
             while answer is not None:
                 yield called.response.FromString(answer)
@@ -116,14 +114,7 @@ class NativeTransport:
             with self.translated(timeout):
                 return self.channel().requests(called.path, packed, left)
 
-        return called.response.FromString(self._repeated(method, call, timeout))
-
-    def _repeated(self, method: str, call: Callable[[float], T], timeout: float) -> T:
-        """Calls, again where that is harmless and a server that was there has gone."""
-        repeat = self.known and method in REPEATABLE
-        answer = reconnecting(call, timeout) if repeat else call(timeout)
-        self.known = True
-        return answer
+        return called.response.FromString(repeated(self, method, call, timeout))
 
     def exchange(self, method: str, *, timeout: float) -> Exchange:
         """See `Transport`."""

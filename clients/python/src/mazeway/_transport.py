@@ -229,3 +229,11 @@ def reconnecting(call: Callable[[float], T], timeout: float, within: float = REC
         except ServerUnreachableError:
             if not backoff.pause():
                 raise
+
+
+def repeated(transport: Transport, method: str, call: Callable[[float], T], timeout: float) -> T:
+    """Calls, again where that is harmless and a server that was there has gone."""
+    repeat = transport.known and method in REPEATABLE
+    answer = reconnecting(call, timeout) if repeat else call(timeout)
+    transport.known = True
+    return answer

@@ -154,7 +154,7 @@ fn remove_file(path: &Path) -> io::Result<()> {
 }
 
 /// The path of a file that SQLite keeps beside a database.
-fn beside(path: &Path, suffix: &str) -> PathBuf {
+pub fn beside(path: &Path, suffix: &str) -> PathBuf {
     let mut name = path.as_os_str().to_owned();
     name.push(suffix);
     name.into()

@@ -3,7 +3,7 @@
 //! Invariants: a migration, once released, never changes; a schema newer than this release is refused, not guessed at;
 //! opening and migrating happen under a lock on a file beside the database, so several processes may start at once.
 
-use super::{StoreError, StoreOptions, fits, room::with_room};
+use super::{StoreError, StoreOptions, fits, repair::beside, room::with_room};
 use rusqlite::{Connection, OpenFlags, config::DbConfig};
 use rusqlite_migration::{M, Migrations};
 use std::{
@@ -216,15 +216,22 @@ pub fn sync_directory(directory: &Path) -> io::Result<()> {
 pub fn open_database(path: &Path, options: &StoreOptions) -> Result<Connection, StoreError> {
     let sqlite = |e: rusqlite::Error| StoreError::from_sqlite(path, &e);
     let flags = OpenFlags::SQLITE_OPEN_READ_WRITE | OpenFlags::SQLITE_OPEN_CREATE | OpenFlags::SQLITE_OPEN_NO_MUTEX;
+    forget_beginning(path).map_err(|e| StoreError::directory(path, &e))?;
     let mut connection = connect(path, flags, options).map_err(sqlite)?;
     connection.busy_timeout(BUSY_TIMEOUT).map_err(sqlite)?;
     check_owner(path, &connection)?;
-    // Heeded where the database is new; an old one keeps its size.
-    connection.pragma_update(None, "page_size", PAGE_BYTES).map_err(sqlite)?;
     // FULL makes a commit in WAL mode wait for the disk; `fullfsync` makes macOS mean it.
-    connection.pragma_update(None, "journal_mode", "WAL").map_err(sqlite)?;
     connection.pragma_update(None, "synchronous", "FULL").map_err(sqlite)?;
     connection.pragma_update(None, "fullfsync", true).map_err(sqlite)?;
+    begin(&connection).map_err(sqlite)?;
+    let mode: String =
+        connection.pragma_update_and_check(None, "journal_mode", "WAL", |row| row.get(0)).map_err(sqlite)?;
+    if mode != "wal" {
+        // SQLite keeps to itself why it goes on in another mode; a write tells.
+        mark(&connection).map_err(sqlite)?;
+        let message = format!("its journal mode stays {mode:?}, expected \"wal\"");
+        return Err(StoreError::Database { path: path.to_owned(), message });
+    }
     connection.pragma_update(None, "foreign_keys", true).map_err(sqlite)?;
     if let Some(pages) = options.checkpoint_pages {
         connection.pragma_update(None, "wal_autocheckpoint", pages).map_err(sqlite)?;
@@ -234,6 +241,30 @@ pub fn open_database(path: &Path, options: &StoreOptions) -> Result<Connection, 
         other => StoreError::Database { path: path.to_owned(), message: other.to_string() },
     })?;
     Ok(connection)
+}
+
+/// Gives a new database its first page, in a commit of its own: where this fails, nothing but opening it anew may follow (see
+/// [`forget_beginning`]), and SQLite would not say that it fails when it changes the journal mode.
+fn begin(connection: &Connection) -> rusqlite::Result<()> {
+    let pages: i64 = connection.pragma_query_value(None, "page_count", |row| row.get(0))?;
+    if pages == 0 {
+        connection.pragma_update(None, "page_size", PAGE_BYTES)?;
+        mark(connection)?;
+    }
+    Ok(())
+}
+
+/// Writes down that a database is ours.
+fn mark(connection: &Connection) -> rusqlite::Result<()> {
+    connection.pragma_update(None, "application_id", APPLICATION_ID)
+}
+
+/// Takes away an empty database that has a journal, before SQLite does the opposite: one whose first commit failed. The disk
+/// may have written some of that commit and lost that the file was cut again, and SQLite, which takes the journal for a
+/// leftover, would take away what tells the next one to cut it. The caller holds the lock of the opening.
+fn forget_beginning(path: &Path) -> io::Result<()> {
+    let empty = fs::metadata(path).is_ok_and(|file| file.len() == 0);
+    if empty && fs::exists(beside(path, "-journal"))? { fs::remove_file(path) } else { Ok(()) }
 }
 
 fn connect(path: &Path, flags: OpenFlags, options: &StoreOptions) -> rusqlite::Result<Connection> {
@@ -346,6 +377,29 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         fs::write(directory.path().join(FILE_NAME), "not a database, whatever its name says ".repeat(50)).unwrap();
         assert!(matches!(open(directory.path()).unwrap_err(), StoreError::Corrupt { .. }));
+    }
+
+    #[test]
+    fn a_beginning_that_failed_is_forgotten() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join(FILE_NAME);
+        // Held open, so that a new file cannot take its number.
+        let begun = File::create(&path).unwrap();
+        fs::write(beside(&path, "-journal"), vec![7; 1000]).unwrap();
+        drop(open(directory.path()).unwrap());
+        assert_eq!(begun.metadata().unwrap().len(), 0, "the old file was left alone");
+        assert!(fs::metadata(&path).unwrap().len() > 0);
+        assert!(!beside(&path, "-journal").exists());
+    }
+
+    #[test]
+    #[cfg(unix)]
+    fn a_disk_that_has_no_write_ahead_log_is_refused() {
+        let directory = tempfile::tempdir().unwrap();
+        // SQLite's locks by files have no index for a log; it would go on without one.
+        let options = StoreOptions { vfs: Some("unix-dotfile".into()), ..StoreOptions::default() };
+        let error = super::open(directory.path(), &options).unwrap_err();
+        assert!(matches!(&error, StoreError::Database { message, .. } if message.contains("journal mode")), "{error}");
     }
 
     #[test]

@@ -4,7 +4,7 @@ use super::{
     disk::{Disk, Fault, Image, below},
     history::{Contents, Step, extra, fault, steps},
     subject::{Segment, Subject},
-    vfs::{self, mount, unmount},
+    vfs::{self, mount, unmount, with_disk},
 };
 use crate::memory;
 use mazeway_learner::store::{self, FILE_NAME, Filter, Recording, Store, StoreError, StoreOptions};
@@ -25,6 +25,8 @@ use tokio::runtime::Runtime;
 const CUTS: usize = 24;
 /// Pages after which a log is written back: few, so that it happens often.
 const CHECKPOINT_PAGES: u32 = 12;
+/// Events of a generation that are its beginning, from where one cut in four is taken: a store is made and opened there.
+const BEGINNING: usize = 48;
 /// After one cut in so many a page is damaged as well.
 const DAMAGE_ONE_IN: usize = 16;
 /// Bytes that are damaged.
@@ -112,6 +114,7 @@ impl Bench {
     }
 
     pub(super) fn open(directory: &Path) -> Result<Store, StoreError> {
+        with_disk(directory, forget_a_beginning);
         let options = StoreOptions {
             checkpoint_pages: Some(CHECKPOINT_PAGES),
             vfs: Some(vfs::NAME.into()),
@@ -138,7 +141,8 @@ impl Bench {
             tally += done;
             let mut survivors = None;
             for _ in 0..CUTS {
-                let moment = below(&mut rng, disk.now() + 1);
+                let events = if below(&mut rng, 4) == 0 { disk.now().min(BEGINNING) } else { disk.now() };
+                let moment = below(&mut rng, events + 1);
                 image = disk.cut(moment, &mut rng);
                 let segment = &segments[segments.partition_point(|segment| segment.from <= moment) - 1];
                 let found = self.survivors(&image, &segment.allowed, &mut rng)?;
@@ -289,6 +293,15 @@ fn damage(
         prop_assert!(!verified.is_sound() || left == *found, "{}", describe(&left));
     }
     Ok(())
+}
+
+/// What opening a store does to a real directory, whose files SQLite's file system does not show it: a database that was begun
+/// and taken back is forgotten.
+fn forget_a_beginning(disk: &mut Disk) {
+    let journal = format!("{FILE_NAME}-journal");
+    if disk.find(FILE_NAME).is_some_and(|file| disk.len(file) == 0) && disk.find(&journal).is_some() {
+        disk.delete(FILE_NAME);
+    }
 }
 
 /// An error may be the disk's alone.

@@ -41,6 +41,8 @@ pub struct Report {
     /// Cores that the learner used meanwhile.
     learner_busy: f64,
     pinned: bool,
+    /// The client that was timed ran before all else on its core.
+    ahead: bool,
 }
 
 impl Report {
@@ -67,7 +69,7 @@ impl Report {
     /// One object for programs.
     pub fn to_json(&self) -> Value {
         json!({
-            "benchmark": "soak-fits", "pinned": self.pinned, "bare": self.bare.to_json(), "alone": self.alone.to_json(),
+            "benchmark": "soak-fits", "pinned": self.pinned, "ahead": self.ahead, "bare": self.bare.to_json(), "alone": self.alone.to_json(),
             "beside_fits": self.beside.to_json(), "ratio": self.ratio(), "learner_busy_cores": self.learner_busy,
         })
     }
@@ -94,7 +96,7 @@ impl Report {
 pub fn run(plan: &Plan, learner: &Path) -> io::Result<Report> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
     let (server, learner) = (Server::start(&plan.server, plan.pinned)?, Learner::start(learner, plan.pinned)?);
-    plan.take_place()?;
+    let ahead = plan.take_place()?;
     let bare = {
         let echo = Echo::start(&plan.soak, plan.pinned)?;
         runtime.block_on(probe::echo(&echo.address, plan.quiet()))?
@@ -116,7 +118,7 @@ pub fn run(plan: &Plan, learner: &Path) -> io::Result<Report> {
     let learner_busy = (learner.processor_secs()? - processor) / since.elapsed().as_secs_f64();
     drop(learner);
     let _ = fits.join();
-    Ok(Report { bare, alone, beside, learner_busy, pinned: plan.pinned })
+    Ok(Report { bare, alone, beside, learner_busy, pinned: plan.pinned, ahead })
 }
 
 /// Has a learner fit until it is no more; tells of every fit that begins.

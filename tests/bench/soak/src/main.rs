@@ -1,6 +1,7 @@
 //! `soak`: holds a server under load for as long as one likes, and prints what was seen.
 //!
-//! Ends with 1 and a line that says what was missed where it was not what docs/RELIABILITY.md promises. `cargo run --release -p mazeway-bench-soak -- --minutes 60` builds the server in the same profile first. Linux alone: it
+//! Ends with 1 and a line that says what was missed where it was not what docs/RELIABILITY.md promises.
+//! `cargo run --release -p mazeway-bench-soak -- --minutes 60` builds the server in the same profile first. Linux alone: it
 //! looks into `/proc` and runs `chrt`, `taskset` and `kill`.
 
 use clap::{Args, Parser, Subcommand};
@@ -27,7 +28,8 @@ struct RunArgs {
     /// How long the load lasts.
     #[arg(long, default_value_t = 5.0, value_name = "N")]
     minutes: f64,
-    /// The server on the first core, all else on the second: as if on two machines.
+    /// The server on the first core, all else on the second, where the client that is timed comes first: as if on three
+    /// machines.
     #[arg(long)]
     pinned: bool,
     /// Instead of the load, a learner on the cores of the server that fits without end: how long steps take beside fits.

@@ -20,6 +20,10 @@ const LEFT_BYTES: f64 = 12.0 * 1024.0 * 1024.0;
 /// what those caches hold varies by so much.
 const GROWTH_BYTES: f64 = 2.0 * 1024.0 * 1024.0;
 
+/// What is said where the client that is timed may not run before its load.
+pub const NOT_AHEAD: &str =
+    "this machine gives no real-time priority: steps under load also waited for the load on their core\n";
+
 /// What the server said of the load while it was there.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Crowd {
@@ -91,6 +95,8 @@ pub struct Report {
     pub load_secs: f64,
     /// The server had a core of its own.
     pub pinned: bool,
+    /// The client that was timed ran before the load on the other.
+    pub ahead: bool,
 }
 
 impl Report {
@@ -155,7 +161,7 @@ impl Report {
         let (Crowd { samples, sessions_least, sessions_mean, calls_mean, connections_most }, ends) =
             (self.crowd, self.ends);
         json!({
-            "benchmark": "soak", "pinned": self.pinned, "load_secs": self.load_secs,
+            "benchmark": "soak", "pinned": self.pinned, "ahead": self.ahead, "load_secs": self.load_secs,
             "bare": self.bare.to_json(), "unloaded": self.unloaded.to_json(), "loaded": self.loaded.to_json(),
             "ratio": self.ratio(), "steps_a_second": self.steps_a_second, "busy_cores": self.busy,
             "samples": samples, "sessions_least": sessions_least, "sessions_mean": sessions_mean,
@@ -172,6 +178,9 @@ impl Report {
         let rows =
             [("bare socket, without load", &self.bare), ("without load", &self.unloaded), ("under load", &self.loaded)];
         let mut text = waits_table(&rows);
+        if self.pinned && !self.ahead {
+            text.push_str(NOT_AHEAD);
+        }
         let (median, p99) = (self.unloaded.median, self.loaded.p99);
         let _ = writeln!(
             text,

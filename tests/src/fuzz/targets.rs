@@ -355,8 +355,14 @@ fn model_message(bytes: &[u8]) -> Result<String, String> {
 /// A database: checked, opened, read in every way; one in sixteen is repaired, which takes longer than all else.
 fn store_file(bytes: &[u8]) -> Result<String, String> {
     let directory = directory().join("store");
-    let _ = fs::remove_dir_all(&directory);
-    fs::create_dir(&directory).expect("a directory");
+    fs::create_dir_all(&directory).expect("a directory");
+    // What a store keeps beside its database is the same for every input, and dear to make.
+    for entry in fs::read_dir(&directory).expect("a directory") {
+        let path = entry.expect("an entry").path();
+        if path.file_name().is_some_and(|name| name.to_string_lossy().starts_with(store::FILE_NAME)) {
+            fs::remove_file(path).expect("a file");
+        }
+    }
     fs::write(directory.join(store::FILE_NAME), bytes).expect("a file");
     let text = |error: store::StoreError| error.to_string();
     let found = store::verify(&directory).map_err(text)?;

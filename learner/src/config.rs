@@ -1,7 +1,7 @@
 //! Settings of the learner service: where it keeps its data, limits and times.
 
-use clap::builder::RangedU64ValueParser;
 use mazeway_serving::DoorConfig;
+use mazeway_serving::config::count;
 use std::{ops::RangeInclusive, path::PathBuf, time::Duration};
 
 /// Everything that a learner service can be told.
@@ -99,11 +99,6 @@ impl Default for Limits {
 
 /// Bytes that a message may have at most: enough for any call without an array, and no more than gRPC can count.
 const MESSAGE_BYTES: RangeInclusive<u64> = 1024..=i32::MAX as u64;
-
-/// A number within bounds.
-fn count(bounds: RangeInclusive<u64>) -> RangedU64ValueParser<usize> {
-    RangedU64ValueParser::new().range(bounds)
-}
 
 /// Longest time that any setting may be.
 const LONGEST: Duration = Duration::from_hours(365 * 24);

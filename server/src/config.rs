@@ -1,9 +1,12 @@
 //! Settings of a server: limits and times, each a flag, a variable and a key of the binary's file of settings.
 
 use crate::sessions::Limits;
-use clap::{CommandFactory as _, builder::RangedU64ValueParser};
-use mazeway_serving::{DoorConfig, ListenAddress, TelemetryConfig, config::seconds, token_command::TokenArgs};
-use std::{ops::RangeInclusive, path::PathBuf, time::Duration};
+use mazeway_serving::{
+    DoorConfig, ListenAddress, TelemetryConfig,
+    config::{ENOUGH, count, seconds},
+    token_command::TokenArgs,
+};
+use std::{path::PathBuf, time::Duration};
 
 /// Everything that a server can be told. [`Config::default`] has the defaults of the flags.
 #[derive(Debug, Clone, PartialEq, clap::Args)]
@@ -112,21 +115,6 @@ impl Config {
     }
 }
 
-/// More than any server has room for, and few enough to be counted everywhere.
-const ENOUGH: u64 = 1 << 30;
-
-/// A number within bounds.
-fn count(bounds: RangeInclusive<u64>) -> RangedU64ValueParser<usize> {
-    RangedU64ValueParser::new().range(bounds)
-}
-
-/// The settings of the door within bounds: with less, nobody could come in or call. For any command that has them.
-pub fn bounded(command: clap::Command) -> clap::Command {
-    command
-        .mut_arg("max_connections", |arg| arg.value_parser(count(1..=ENOUGH)))
-        .mut_arg("max_metadata_bytes", |arg| arg.value_parser(clap::value_parser!(u32).range(1024..=1 << 24)))
-}
-
 /// What begins the name of every variable: `MAZEWAY_SERVER_MAX_SESSIONS` is `--max-sessions`.
 pub const VARIABLES: &str = "MAZEWAY_SERVER_";
 
@@ -148,11 +136,6 @@ pub struct Cli {
     /// Everything that can be set.
     #[command(flatten)]
     pub settings: Settings,
-}
-
-/// The command line as it is parsed.
-pub fn command() -> clap::Command {
-    bounded(Cli::command()).mut_subcommand("config", bounded)
 }
 
 /// What the binary does beside serving.

@@ -1,11 +1,13 @@
 //! The environment server's binary.
 
+use clap::CommandFactory as _;
 use mazeway_server::{
     Listener,
-    config::{Cli, Command, PLACES, Settings, VARIABLES, command},
+    config::{Cli, Command, PLACES, Settings, VARIABLES},
     serve_observed,
 };
 use mazeway_serving::{
+    running::until_stopped,
     settings::{self, SettingsError},
     telemetry::{
         endpoint::{self, Endpoint},
@@ -25,7 +27,7 @@ use std::{
 static ALLOCATOR: tikv_jemallocator::Jemalloc = tikv_jemallocator::Jemalloc;
 
 fn main() -> ExitCode {
-    let parsed = settings::parse(command(), VARIABLES, &PLACES, env::args_os());
+    let parsed = settings::parse(Cli::command(), VARIABLES, &PLACES, env::args_os());
     let (cli, settings) = match parsed.and_then(|settings| Ok((settings.typed::<Cli>()?, settings))) {
         Ok(parsed) => parsed,
         Err(SettingsError::Usage(error)) if !error.use_stderr() => {
@@ -62,7 +64,7 @@ fn main() -> ExitCode {
         Ok(runtime) => runtime,
         Err(error) => return refuse(1, &format!("no threads to run on: {error}"), "raise the limit on processes"),
     };
-    runtime.block_on(run(cli))
+    runtime.block_on(run(cli, &settings))
 }
 
 /// clap's several paragraphs in two lines.
@@ -71,7 +73,7 @@ fn misused(error: &clap::Error) -> ExitCode {
     // The first says what is wrong, and may name the arguments that are missing on lines of their own.
     let first = text.split("\n\n").next().unwrap_or_default();
     let message = first.split_whitespace().collect::<Vec<_>>().join(" ");
-    let asked = env::args().nth(1).filter(|word| command().find_subcommand(word).is_some());
+    let asked = env::args().nth(1).filter(|word| Cli::command().find_subcommand(word).is_some());
     let program = asked.map_or_else(|| "server".to_owned(), |word| format!("server {word}"));
     refuse(2, message.strip_prefix("error: ").unwrap_or(&message), &format!("see '{program} --help'"))
 }
@@ -86,11 +88,12 @@ fn print(text: &str) -> ExitCode {
     }
 }
 
-async fn run(cli: Settings) -> ExitCode {
+async fn run(cli: Settings, from: &settings::Settings) -> ExitCode {
     let spans = match logs::start(&cli.telemetry, "mazeway-server") {
         Ok(spans) => spans,
         Err(error) => return refuse(2, &format!("no spans can be exported: {error}"), "see 'server --help'"),
     };
+    from.warn_of_strangers();
     let code = observed(cli).await;
     spans.flush().await;
     code
@@ -114,49 +117,15 @@ async fn observed(cli: Settings) -> ExitCode {
             }
         },
     };
-    // Before anyone is told that the server is there, and may tell it to stop.
-    let stop = match stop_signal() {
-        Ok(stop) => stop,
+    let address = listener.address().unwrap_or(cli.listen);
+    let stopped = match until_stopped(address, shown.as_ref().map(Endpoint::address)) {
+        Ok(stopped) => stopped,
         Err(error) => return refuse(1, &format!("cannot catch signals: {error}"), "raise the limit on open files"),
     };
-    let address = listener.address().unwrap_or(cli.listen);
-    // First polled when everything has started: who reads the lines may connect.
-    let numbers = shown.as_ref().map(Endpoint::address);
-    let told_to_stop = async move {
-        say(&format!("listening on {address}"));
-        if let Some(numbers) = numbers {
-            say(&format!("metrics on http://{numbers}/metrics"));
-        }
-        stop.await;
-    };
-    match serve_observed(cli.limits, listener, telemetry, told_to_stop).await {
+    match serve_observed(cli.limits, listener, telemetry, stopped).await {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => refuse(1, &error.to_string(), "add --log info to see more"),
     }
-}
-
-/// Writes a line. Whoever started this may have closed the other end; the server serves all the same.
-fn say(line: &str) {
-    let _ = writeln!(io::stdout(), "{line}").and_then(|()| io::stdout().flush());
-}
-
-/// SIGINT or SIGTERM, caught from this call on.
-fn stop_signal() -> io::Result<impl Future<Output = ()>> {
-    #[cfg(unix)]
-    {
-        use tokio::signal::unix::{SignalKind, signal};
-        let (mut interrupt, mut terminate) = (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?);
-        Ok(async move {
-            tokio::select! {
-                _ = interrupt.recv() => {}
-                _ = terminate.recv() => {}
-            }
-        })
-    }
-    #[cfg(not(unix))]
-    Ok(async {
-        let _ = tokio::signal::ctrl_c().await;
-    })
 }
 
 fn refuse(code: u8, error: &str, hint: &str) -> ExitCode {

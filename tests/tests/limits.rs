@@ -13,8 +13,10 @@ use std::time::Duration;
 use tokio::{
     io::{AsyncReadExt as _, AsyncWriteExt as _},
     net::TcpStream,
+    sync::mpsc,
     time::{Instant, sleep, timeout},
 };
+use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Request, Response, Status, Streaming, transport::Channel};
 use tonic_health::pb::{HealthCheckRequest, HealthCheckResponse, health_client::HealthClient};
 
@@ -54,6 +56,45 @@ async fn a_call_that_asks_for_no_deadline_has_one() {
     wrong.metadata_mut().insert("grpc-timeout", "soon".parse().expect("a value"));
     let status = service.list_environments(wrong).await.expect_err("no time");
     assert!(status.code() == Code::InvalidArgument && status.message().starts_with("grpc-timeout: "), "{status}");
+}
+
+#[tokio::test]
+async fn a_deadline_is_cut_to_the_longest_there_is() {
+    let door = DoorConfig { max_call_deadline: Duration::from_millis(1), ..DoorConfig::default() };
+    let server = EnvServer::with(Config { door, max_envs_per_session: 65_536, ..config() });
+    let mut service = service(&server).await;
+    let large = pb::CreateSessionRequest { env_id: "Highway-v0".into(), num_envs: 65_536, ..Default::default() };
+    let mut request = Request::new(large);
+    request.set_timeout(Duration::from_hours(1));
+    let status = service.create_session(request).await.expect_err("it takes longer");
+    assert_eq!(status.code(), Code::DeadlineExceeded, "{status}");
+}
+
+#[tokio::test]
+async fn streams_beyond_the_limit_of_their_connection_wait_for_their_turn() {
+    let server = EnvServer::with(Config { max_streams_per_connection: 2, ..config() });
+    let (mut full, mut other) = (service(&server).await, service(&server).await);
+    let (first, requests) = mpsc::channel(1);
+    let _answers = full.interact(ReceiverStream::new(requests)).await.expect("a stream");
+    let _second = full.interact(tokio_stream::pending()).await.expect("a stream");
+    timeout(Duration::from_millis(200), lists(&mut full.clone())).await.expect_err("there is no room");
+    assert!(lists(&mut other).await, "another connection has its own");
+    // Who says that there are no more requests ends a stream.
+    drop(first);
+    assert!(timeout(Duration::from_secs(10), lists(&mut full)).await.expect("its turn comes"));
+}
+
+#[tokio::test]
+async fn a_peer_that_answers_no_ping_is_let_go() {
+    let server = EnvServer::with(Config { keepalive: Duration::from_millis(200), ..config() });
+    let mut service = service(&server).await;
+    let mut stream = service.interact(tokio_stream::pending()).await.expect("a stream").into_inner();
+    let mut mute = TcpStream::connect(server.socket()).await.expect("connects");
+    mute.write_all(b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n\0\0\0\x04\0\0\0\0\0").await.expect("greets");
+    // It has ten seconds to answer.
+    let lasted = ends(mute).await;
+    assert!(lasted >= Duration::from_secs(10) && lasted < Duration::from_secs(15), "{lasted:?}");
+    timeout(Duration::from_millis(100), stream.message()).await.expect_err("one that answers stays");
 }
 
 /// Waits for the end of a connection, and says how long that took.

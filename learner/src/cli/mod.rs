@@ -142,12 +142,6 @@ pub fn unreachable(error: &ClientError, start: impl Into<String>) -> CliError {
     }
 }
 
-/// The command line as it is parsed.
-fn command() -> clap::Command {
-    let places = serve::PLACES.into_iter().flatten();
-    places.fold(Cli::command(), |command, place| command.mut_subcommand(place, mazeway_server::config::bounded))
-}
-
 /// Whether a word names a command.
 fn is_command(word: &str) -> bool {
     Cli::command().get_subcommands().any(|command| command.get_name() == word)
@@ -166,7 +160,7 @@ pub fn data_directory(asked: Option<PathBuf>) -> Result<PathBuf, CliError> {
 
 /// Parses the arguments, runs the command and says how it went.
 pub fn main() -> ExitCode {
-    let parsed = settings::parse(command(), serve::VARIABLES, &serve::PLACES, std::env::args_os());
+    let parsed = settings::parse(Cli::command(), serve::VARIABLES, &serve::PLACES, std::env::args_os());
     let (cli, settings) = match parsed.and_then(|settings| Ok((settings.typed::<Cli>()?, settings))) {
         Ok(parsed) => parsed,
         Err(SettingsError::Usage(error)) => return error::report_usage(&error),
@@ -214,6 +208,7 @@ async fn run(command: Command, settings: &Settings) -> Result<(), CliError> {
             let spans = logs::start(args.telemetry(), "mazeway-learner").map_err(|error| {
                 CliError::usage(format!("no spans can be exported: {error}"), "see 'learner serve --help'")
             })?;
+            settings.warn_of_strangers();
             let outcome = serve::run(*args).await;
             spans.flush().await;
             outcome

@@ -5,6 +5,7 @@ use clap::Args;
 use mazeway_learner::{Config, config::Limits};
 use mazeway_serving::{
     DoorConfig, ListenAddress, Listener, TelemetryConfig,
+    running::until_stopped,
     telemetry::endpoint::{self, Endpoint},
     token_command::TokenArgs,
 };
@@ -80,7 +81,6 @@ pub async fn run(args: ServeArgs) -> Result<(), CliError> {
         |error: std::io::Error| CliError::failure(format!("cannot listen on {listen}: {error}"), listen.otherwise());
     let no_signals =
         |error| CliError::failure(format!("cannot watch for signals: {error}"), "raise the limit on open files");
-    let stopped = stop_signal().map_err(no_signals)?;
     let listener = Listener::bind(&listen).await.map_err(cannot)?;
     let address = listener.address().map_err(cannot)?;
     let numbers = Arc::new(mazeway_learner::telemetry());
@@ -96,39 +96,7 @@ pub async fn run(args: ServeArgs) -> Result<(), CliError> {
     if let Err(error) = rayon::ThreadPoolBuilder::new().start_handler(yielding).build_global() {
         tracing::debug!(%error, "threads that compute have the priority of all others");
     }
-    let metrics = shown.as_ref().map(Endpoint::address);
-    // First polled when everything has started: who reads the lines may connect.
-    let told_to_stop = async move {
-        say(&format!("listening on {address}"));
-        if let Some(metrics) = metrics {
-            say(&format!("metrics on http://{metrics}/metrics"));
-        }
-        stopped.await;
-    };
-    mazeway_learner::serve_observed(Config { data, limits, door }, listener, numbers, told_to_stop).await?;
+    let stopped = until_stopped(address, shown.as_ref().map(Endpoint::address)).map_err(no_signals)?;
+    mazeway_learner::serve_observed(Config { data, limits, door }, listener, numbers, stopped).await?;
     Ok(())
-}
-
-/// Writes a line. Whoever started this may have closed the other end; the service serves all the same.
-fn say(line: &str) {
-    let _ = writeln!(std::io::stdout(), "{line}").and_then(|()| std::io::stdout().flush());
-}
-
-/// SIGINT or SIGTERM. They are watched from the call on, not only once the future is waited for.
-fn stop_signal() -> std::io::Result<impl Future<Output = ()>> {
-    #[cfg(unix)]
-    {
-        use tokio::signal::unix::{SignalKind, signal};
-        let (mut interrupt, mut terminate) = (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?);
-        Ok(async move {
-            tokio::select! {
-                _ = interrupt.recv() => {}
-                _ = terminate.recv() => {}
-            }
-        })
-    }
-    #[cfg(not(unix))]
-    Ok(async {
-        let _ = tokio::signal::ctrl_c().await;
-    })
 }

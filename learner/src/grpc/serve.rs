@@ -10,11 +10,12 @@ use mazeway_serving::{
     DoorError, Listener,
     connections::Gate,
     door::Door,
+    running::ends_within,
     telemetry::Telemetry,
     transport::{Transport, Wire},
 };
 use std::{future::Future, sync::Arc, time::Duration};
-use tokio::{task::spawn_blocking, time::timeout};
+use tokio::task::spawn_blocking;
 use tokio_util::{sync::CancellationToken, task::TaskTracker};
 use tonic::service::Routes;
 use tonic_health::{ServingStatus, server::HealthReporter};
@@ -23,10 +24,6 @@ use tonic_health::{ServingStatus, server::HealthReporter};
 const WINDOW_BYTES: u32 = 4 << 20;
 /// Largest frame taken in.
 const FRAME_BYTES: u32 = 64 << 10;
-
-/// Time before the end of the grace in which whoever is still inside is told that the service stops, a quarter of the grace
-/// at most.
-const LAST_WORDS: Duration = Duration::from_secs(1);
 
 /// What health calls the taking of recordings, which needs room on the disk; all else goes on without.
 const RECORDING: &str = "mazeway.learner.v1.LearnerService/RecordTrajectories";
@@ -158,10 +155,7 @@ async fn serve_store(
     drop(gate);
     stopping.cancel();
     connections.close();
-    if timeout(grace.saturating_sub(LAST_WORDS.min(grace / 4)), connections.wait()).await.is_err() {
-        aborting.cancel();
-        connections.wait().await;
-    }
+    ends_within(grace, connections.wait(), &aborting).await;
     Ok(())
 }
 

@@ -5,7 +5,8 @@ use crate::{
     listen::ListenAddress,
     tls::{TlsError, TlsFiles},
 };
-use std::{path::PathBuf, time::Duration};
+use clap::builder::RangedU64ValueParser;
+use std::{ops::RangeInclusive, path::PathBuf, time::Duration};
 use tokio_rustls::TlsAcceptor;
 
 /// Everything that the door can be told. [`DoorConfig::default`] has the defaults of the flags.
@@ -29,10 +30,10 @@ pub struct DoorConfig {
     #[arg(long)]
     pub open_reflection: bool,
     /// Connections at a time; a further one is closed at once.
-    #[arg(long, default_value_t = 1024, value_name = "N")]
+    #[arg(long, default_value_t = 1024, value_parser = count(1..=ENOUGH), value_name = "N")]
     pub max_connections: usize,
     /// Bytes of all metadata of a call together.
-    #[arg(long, default_value_t = 16 << 10, value_name = "BYTES")]
+    #[arg(long, default_value_t = 16 << 10, value_parser = clap::value_parser!(u32).range(1024..=1 << 24), value_name = "BYTES")]
     pub max_metadata_bytes: u32,
     /// Calls of one connection that it may give up within a second; with more it is closed.
     #[arg(long, default_value_t = 1000, value_name = "N")]
@@ -150,6 +151,14 @@ impl DoorConfig {
             "add --tls-cert, --tls-key and --tokens (or --tls-client-ca), listen on 127.0.0.1, or add --insecure where the network is trusted",
         ))
     }
+}
+
+/// More than any service has room for, and few enough to be counted everywhere.
+pub const ENOUGH: u64 = 1 << 30;
+
+/// A number within bounds.
+pub fn count(bounds: RangeInclusive<u64>) -> RangedU64ValueParser<usize> {
+    RangedU64ValueParser::new().range(bounds)
 }
 
 /// Longest time that any setting may be.

@@ -12,6 +12,7 @@ pub mod grant;
 pub mod keyring;
 pub mod listen;
 pub mod rules;
+pub mod running;
 pub mod settings;
 pub mod socket;
 pub mod spin;

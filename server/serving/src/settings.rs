@@ -48,6 +48,8 @@ pub struct Settings {
     file: Option<PathBuf>,
     /// Keys that it has.
     from_file: Vec<String>,
+    /// Variables that look like settings and are none, each with what it may have meant.
+    strangers: Vec<String>,
 }
 
 /// Where the flags of a service are: at the command itself, or at a command below it.
@@ -70,9 +72,10 @@ pub fn parse(
     let below = matches.subcommand_name().and_then(|name| places.iter().flatten().find(|place| **place == name));
     let own = |command: &Command| below.map_or(command.clone(), |name| subcommand(command, name));
     let flags = below.map_or(Some(&matches), |name| matches.subcommand_matches(name));
+    let strangers = strangers(&own(&command), prefix, std::env::vars_os().map(|(name, _)| name));
     let asked = flags.and_then(|flags| flags.try_get_one::<PathBuf>("config").ok().flatten()).cloned();
     let Some(path) = asked else {
-        return Ok(Settings { command: own(&command), matches, file: None, from_file: Vec::new() });
+        return Ok(Settings { command: own(&command), matches, file: None, from_file: Vec::new(), strangers });
     };
     let read = read(&path).and_then(|text| values(&text, &own(&command)));
     let values = read.map_err(|message| SettingsError::File { path: path.clone(), message })?;
@@ -88,7 +91,7 @@ pub fn parse(
         None => with_defaults(command),
     };
     let matches = command.clone().try_get_matches_from(&args).map_err(usage)?;
-    Ok(Settings { command: own(&command), matches, file: Some(path), from_file })
+    Ok(Settings { command: own(&command), matches, file: Some(path), from_file, strangers })
 }
 
 /// The command with a variable for every flag.
@@ -110,6 +113,24 @@ fn with_variables(command: Command, prefix: &str, places: &[Place]) -> Command {
         };
     }
     command
+}
+
+/// The names of variables that begin like those of settings and are none of `command`'s.
+fn strangers(command: &Command, prefix: &str, names: impl Iterator<Item = OsString>) -> Vec<String> {
+    let mut strangers: Vec<_> = names
+        .filter_map(|name| name.into_string().ok())
+        .filter(|name| name.starts_with(prefix))
+        .filter(|name| !command.get_arguments().any(|arg| arg.get_env().is_some_and(|env| env == name.as_str())))
+        .map(|name| {
+            let long = name[prefix.len()..].to_lowercase().replace('_', "-");
+            match alike(&long, command) {
+                Some(meant) => format!("{name}; did you mean {}?", variable(prefix, meant)),
+                None => name,
+            }
+        })
+        .collect();
+    strangers.sort();
+    strangers
 }
 
 fn variable(prefix: &str, long: &str) -> String {
@@ -167,14 +188,19 @@ pub fn values(text: &str, command: &Command) -> Result<BTreeMap<String, String>,
     Ok(values)
 }
 
-fn unknown(key: &str, long: &str, command: &Command) -> String {
-    let alike = settings(command)
+/// The setting that a name is most like, if any is.
+fn alike<'a>(long: &str, command: &'a Command) -> Option<&'a str> {
+    settings(command)
         .map(|(name, _)| (strsim::jaro_winkler(long, name), name))
         .filter(|(likeness, _)| *likeness >= ALIKE)
-        .max_by(|one, other| one.0.total_cmp(&other.0));
+        .max_by(|one, other| one.0.total_cmp(&other.0))
+        .map(|(_, name)| name)
+}
+
+fn unknown(key: &str, long: &str, command: &Command) -> String {
     let shown: String = key.chars().filter(|c| !c.is_control()).take(80).collect();
-    match alike {
-        Some((_, name)) => format!("there is no setting {shown:?}; did you mean {name:?}?"),
+    match alike(long, command) {
+        Some(name) => format!("there is no setting {shown:?}; did you mean {name:?}?"),
         None => format!("there is no setting {shown:?}"),
     }
 }
@@ -217,10 +243,21 @@ impl Settings {
         }
     }
 
+    /// Logs a warning of every variable that looks like a setting and is none: not an error, since others may set variables
+    /// that begin alike, as Kubernetes does for a service of such a name.
+    pub fn warn_of_strangers(&self) {
+        for stranger in &self.strangers {
+            tracing::warn!("there is no setting {stranger}");
+        }
+    }
+
     /// The configuration as a file that says the same, with where each value comes from.
     pub fn effective(&self) -> String {
         let flags = self.flags();
         let mut text = String::new();
+        for stranger in &self.strangers {
+            let _ = writeln!(text, "# there is no setting {stranger}\n");
+        }
         for (long, arg) in settings(&self.command) {
             if let Some(help) = arg.get_help() {
                 let _ = writeln!(text, "# {}", help.to_string().split_whitespace().collect::<Vec<_>>().join(" "));
@@ -335,6 +372,14 @@ mod tests {
         }
         let missing = run(None, "MAZEWAY_NOBODY_", &["--config", "/nowhere/at/all"]).expect_err("refused");
         assert!(missing.to_string().contains("/nowhere/at/all: cannot be read"), "{missing}");
+    }
+
+    #[test]
+    fn variables_that_are_no_settings_are_named() {
+        let command = with_variables(<Cli as clap::CommandFactory>::command(), "MAZEWAY_X_", &[None]);
+        let names = ["MAZEWAY_X_TOKEN", "MAZEWAY_X_TOKENS", "PATH", "MAZEWAY_X_PORT_1_TCP", "MAZEWAY_X_CONFIG"];
+        let strangers = strangers(&command, "MAZEWAY_X_", names.into_iter().map(OsString::from));
+        assert_eq!(strangers, ["MAZEWAY_X_PORT_1_TCP", "MAZEWAY_X_TOKEN; did you mean MAZEWAY_X_TOKENS?"]);
     }
 
     #[test]

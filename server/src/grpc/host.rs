@@ -33,6 +33,8 @@ pub struct Host {
     pub gallery: Gallery,
     /// Cancelled when the server is told to stop.
     pub shutdown: CancellationToken,
+    /// Cancelled shortly before calls that still run are cut off.
+    pub last_words: CancellationToken,
 }
 
 impl Host {
@@ -47,6 +49,7 @@ impl Host {
             gallery: Gallery::default(),
             config,
             shutdown,
+            last_words: CancellationToken::new(),
         }
     }
 

@@ -8,6 +8,7 @@ use mazeway_serving::{
     DoorError, Listener,
     connections::Gate,
     door::Door,
+    running::ends_within,
     telemetry::Telemetry,
     transport::{Transport, Wire},
 };
@@ -39,7 +40,7 @@ pub enum ServeError {
 }
 
 /// Serves environments, health and reflection on `listener` until `shutdown` is ready, then lets running calls end for
-/// [`Config::shutdown_grace`]. Interactive streams are told to go at once.
+/// [`Config::shutdown_grace`]. Interactive streams are told to go at once, roll-outs shortly before they are cut off.
 ///
 /// # Errors
 /// The settings of the door cannot be followed; there are no threads.
@@ -83,6 +84,7 @@ pub async fn serve_observed(
     let (wire, door_config) = (wire(&config), config.door.clone());
     let (threads, grace, spin) = (config.threads(), config.shutdown_grace, config.spin());
     let host = Arc::new(Host::new(config, &telemetry, stopping.clone()));
+    let last_words = host.last_words.clone();
     let routes = Routes::new(Environments::new(&host))
         .add_service(dm_env::EnvironmentServer(Arc::clone(&host)))
         .add_service(health_service)
@@ -113,11 +115,9 @@ pub async fn serve_observed(
     // Nobody is let in any more, and a Unix socket is gone, before running calls are waited for.
     drop(gate);
     stopping.cancel();
-    let mut ends: FuturesUnordered<_> = workers.iter_mut().map(Worker::ended).collect();
-    let mut outcome = Ok(());
-    while let Some(end) = ends.next().await {
-        outcome = outcome.and(end);
-    }
+    let ends: FuturesUnordered<_> = workers.iter_mut().map(Worker::ended).collect();
+    let ended = ends.fold(Ok(()), |outcome, end| std::future::ready(outcome.and(end)));
+    let outcome = ends_within(grace, ended, &last_words).await;
     reaper.abort();
     outcome
 }

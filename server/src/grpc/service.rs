@@ -18,7 +18,6 @@ use mazeway_proto::env::{self as pb, environment_service_server::EnvironmentServ
 use mazeway_serving::Caller;
 use std::{pin::Pin, sync::Arc, time::Instant};
 use tokio::sync::{mpsc, oneshot};
-use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Request, Response, Status, Streaming};
 
 /// Messages of a roll-out that may wait for their reader.
@@ -101,7 +100,7 @@ impl EnvironmentService for EnvironmentGrpc {
             CallError::Limit { field: "rollouts", what: "roll-outs at a time", limit, asked: limit + 1 }
         })?;
         let (sender, receiver) = mpsc::channel(WAITING_CHUNKS);
-        let host = Arc::clone(host);
+        let (host, last_words) = (Arc::clone(host), host.last_words.clone());
         tokio::task::spawn_blocking(move || {
             let _permit = permit;
             // Sending waits for the reader and fails once it has gone.
@@ -111,7 +110,18 @@ impl EnvironmentService for EnvironmentGrpc {
             };
             environment.roll_out(&plan, &|| sender.is_closed(), &mut emit);
         });
-        Ok(Response::new(Box::pin(ReceiverStream::new(receiver))))
+        let chunks = stream::unfold(Some(receiver), move |receiver| {
+            let last_words = last_words.clone();
+            async move {
+                let mut receiver = receiver?;
+                tokio::select! {
+                    biased;
+                    () = last_words.cancelled() => Some((Err(CallError::ShuttingDown.into()), None)),
+                    chunk = receiver.recv() => Some((chunk?, Some(receiver))),
+                }
+            }
+        });
+        Ok(Response::new(chunks.boxed()))
     }
 
     async fn get_model(&self, request: Request<pb::GetModelRequest>) -> Result<Response<Self::GetModelStream>, Status> {

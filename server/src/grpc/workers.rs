@@ -37,9 +37,14 @@ impl Worker {
     ) -> Result<Self, ServeError> {
         let (arrivals, arriving) = mpsc::unbounded_channel();
         let (end, ended) = oneshot::channel();
-        let runtime =
-            tokio::runtime::Builder::new_current_thread().enable_all().build().map_err(ServeError::Threads)?;
+        let (report, started) = std::sync::mpsc::channel();
         let work = move || {
+            // Made where it runs: one must not be dropped by a task of another.
+            let runtime = match tokio::runtime::Builder::new_current_thread().enable_all().build() {
+                Ok(runtime) => runtime,
+                Err(error) => return drop(report.send(Err(error))),
+            };
+            let _ = report.send(Ok(()));
             runtime.block_on(async {
                 // Both end with the runtime.
                 tokio::spawn(Lane::open());
@@ -51,6 +56,7 @@ impl Worker {
             let _ = end.send(());
         };
         thread::Builder::new().name("mazeway-worker".into()).spawn(work).map_err(ServeError::Threads)?;
+        started.recv().map_err(io::Error::other).flatten().map_err(ServeError::Threads)?;
         Ok(Self { arrivals, load: Load::default(), ended })
     }
 

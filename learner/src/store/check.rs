@@ -26,12 +26,21 @@ use uuid::Uuid;
 const MAX_FINDINGS: u32 = 100;
 /// Damaged things that are named at most, of each kind; all are counted.
 const MAX_NAMED: usize = 10_000;
-/// Keys that are tried in vain at most where the table does not read: more than any damaged page hides.
-const MAX_TRIED: u32 = 1 << 20;
+/// Keys that are tried in vain at most where a table does not read, for each that something tells of: more than damaged pages
+/// hide, and in a small store a moment's worth, wherever damage has put its keys.
+const TRIED_A_KEY: usize = 64;
+/// Fewest that may be.
+const LEAST_TRIED: usize = 1 << 14;
+/// Most that may be.
+const MOST_TRIED: usize = 1 << 20;
 /// Keys beyond the last known one that are tried.
 const BEYOND: i64 = 10_000;
 /// After so many in vain, one more is left out at a time.
 const STRIDE: u32 = 16;
+/// After so many in vain, by when half a page of pages is behind, a sixteenth more is left out at a time.
+const FAR: u32 = 1 << 10;
+/// So many keys that were left out are tried one by one; of more, those at their end.
+const FEW: u64 = 1 << 12;
 
 /// How many of a kind were looked at.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize)]
@@ -178,6 +187,10 @@ pub(super) fn walk<E: From<StoreError>>(
         Err(error) => found.structure.push(error.to_string()),
     }
     let whole = found.structure.is_empty();
+    if snapshot.is_autocommit() {
+        // Damage ends a transaction, and without one every look would lock the file anew.
+        snapshot.execute_batch("BEGIN").map_err(|e| corrupt(&e))?;
+    }
 
     let names = if whole { BTreeMap::new() } else { names(&snapshot) };
     // An id is no part of what is hashed: where the row and the index do not agree on whose it is, nobody knows.
@@ -287,49 +300,83 @@ impl<'a> Keys<'a> {
         Self { connection, table, key, known, guessed }
     }
 
-    /// Every key, rising. The table is asked for the next key that it has, so that gaps cost nothing; where it does not read
-    /// on, the next key is tried, for what follows may lie on a page that reads.
-    fn try_for_each<E>(self, mut visit: impl FnMut(i64) -> Result<(), E>) -> Result<(), E> {
+    /// Every key, rising.
+    fn try_for_each<E>(self, visit: impl FnMut(i64) -> Result<(), E>) -> Result<(), E> {
         let Self { connection, table, key, known, guessed } = self;
         let sql = format!("SELECT {key} FROM {table} NOT INDEXED WHERE {key} >= ? ORDER BY {key} LIMIT 1");
-        let (Some((mut at, last)), Ok(mut statement)) = (guessed, connection.prepare(&sql)) else {
+        let (Some(range), Ok(mut statement)) = (guessed, connection.prepare(&sql)) else {
             return known.into_iter().try_for_each(visit);
         };
-        let mut known = known.into_iter().peekable();
-        let mut vain = Vain { left: MAX_TRIED, in_a_row: 0, step: 1, careful: false };
-        while at <= last && vain.left > 0 {
-            let next = match statement.query_row([at], |row| row.get::<_, i64>(0)) {
-                Ok(next) if next >= at => next,
-                Err(rusqlite::Error::QueryReturnedNoRows) => break,
-                _ => {
-                    if known.next_if_eq(&at).is_some() {
-                        visit(at)?;
-                    }
-                    let further = at.saturating_add(vain.next());
-                    at = known.peek().map_or(further, |known| further.min(*known));
-                    continue;
+        let next_from = |at: i64| match statement.query_row([at], |row| row.get::<_, i64>(0)) {
+            Ok(next) if next >= at => Next::Is(next),
+            Err(rusqlite::Error::QueryReturnedNoRows) => Next::None,
+            _ => Next::Unreadable,
+        };
+        rising(known, range, next_from, visit)
+    }
+}
+
+/// Visits the keys that are `known` and those that a table tells within a range. It is asked for the next key that it has, so
+/// that gaps cost nothing; where it does not read on, the next key is tried, for what follows may lie on a page that reads.
+fn rising<E>(
+    known: Vec<i64>,
+    (first, last): (i64, i64),
+    mut next_from: impl FnMut(i64) -> Next,
+    mut visit: impl FnMut(i64) -> Result<(), E>,
+) -> Result<(), E> {
+    let mut vain = Vain::new(known.len());
+    let mut known = known.into_iter().peekable();
+    // The next to be tried, and the last that was tried in vain.
+    let (mut at, mut failed) = (first, first);
+    while at <= last && vain.left > 0 {
+        let next = match next_from(at) {
+            Next::Is(next) => next,
+            Next::None => break,
+            Next::Unreadable => {
+                if known.next_if_eq(&at).is_some() {
+                    visit(at)?;
                 }
-            };
-            if let Some(back) = vain.ends() {
-                at -= back;
+                failed = at;
+                let further = at.saturating_add(vain.next());
+                at = known.peek().map_or(further, |known| further.min(*known));
                 continue;
             }
-            while let Some(missing) = known.next_if(|known| *known < next) {
-                visit(missing)?;
+        };
+        if vain.ends(at.abs_diff(failed) > 1) {
+            // Back to what was left out: to all of it, or to where it ends.
+            while at.abs_diff(failed) > FEW && vain.left > 0 {
+                let middle = failed.midpoint(at);
+                vain.left -= 1;
+                match next_from(middle) {
+                    Next::Is(_) => at = middle,
+                    Next::None | Next::Unreadable => failed = middle,
+                }
             }
-            known.next_if_eq(&next);
-            visit(next)?;
-            let Some(after) = next.checked_add(1) else { break };
-            at = after;
+            at = failed + 1;
+            continue;
         }
-        known.try_for_each(visit)
+        while let Some(missing) = known.next_if(|known| *known < next) {
+            visit(missing)?;
+        }
+        known.next_if_eq(&next);
+        visit(next)?;
+        let Some(after) = next.checked_add(1) else { break };
+        (at, failed) = (after, next);
     }
+    known.try_for_each(visit)
+}
+
+/// What a table says of the next key from some key on.
+enum Next {
+    Is(i64),
+    None,
+    Unreadable,
 }
 
 /// Keys that are tried in vain, one after the other.
 struct Vain {
     /// How many more may be.
-    left: u32,
+    left: usize,
     in_a_row: u32,
     /// From the last one to the next.
     step: i64,
@@ -338,22 +385,31 @@ struct Vain {
 }
 
 impl Vain {
+    /// Where so many keys are known.
+    fn new(known: usize) -> Self {
+        let left = known.saturating_mul(TRIED_A_KEY).clamp(LEAST_TRIED, MOST_TRIED);
+        Self { left, in_a_row: 0, step: 1, careful: false }
+    }
+
     /// One more was; how far it is to the next: further and further, so that the way is short even to a key that damage has
     /// put far away. Pages that read between two that do not are met unless they hold less than a sixteenth of what lies before.
     fn next(&mut self) -> i64 {
         self.left -= 1;
         self.in_a_row += 1;
-        self.step = if self.careful { 1 } else { 1 + i64::from(self.in_a_row / STRIDE) };
+        self.step = match self.in_a_row {
+            _ if self.careful => 1,
+            ..FAR => 1 + i64::from(self.in_a_row / STRIDE),
+            _ => self.step.saturating_add(self.step / i64::from(STRIDE)),
+        };
         self.step
     }
 
-    /// One was not in vain: how far to go back for what was left out before it, which is then tried key by key.
-    fn ends(&mut self) -> Option<i64> {
-        let left_out = self.step - 1;
+    /// One was not in vain: whether what was left out before it, if anything `was`, is to be tried key by key.
+    fn ends(&mut self, was: bool) -> bool {
         self.in_a_row = 0;
         self.step = 1;
-        self.careful = left_out > 0;
-        self.careful.then_some(left_out)
+        self.careful = was;
+        was
     }
 }
 
@@ -432,5 +488,70 @@ fn trajectory(
     match checked {
         Ok(recording) => Ok(Some((recorded_at_us, recording))),
         Err(error) => Err((id, error)),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::{collection::vec, prelude::*};
+    use std::{collections::BTreeSet, convert::Infallible, ops::RangeInclusive};
+
+    /// What is visited of a table with these keys, of which some ranges do not read and some are known, and how often the table
+    /// was asked.
+    fn visited(keys: &BTreeSet<i64>, broken: &[RangeInclusive<i64>], known: &BTreeSet<i64>) -> (Vec<i64>, usize) {
+        let (mut visited, mut asked) = (Vec::new(), 0);
+        let next_from = |at: i64| {
+            asked += 1;
+            match keys.range(at..).next() {
+                _ if broken.iter().any(|range| range.contains(&at)) => Next::Unreadable,
+                Some(next) if broken.iter().any(|range| range.contains(next)) => Next::Unreadable,
+                Some(&next) => Next::Is(next),
+                None => Next::None,
+            }
+        };
+        let range =
+            (known.first().copied().unwrap_or(1).min(1), known.last().map_or(0, |last| last.saturating_add(BEYOND)));
+        let visit = |key| {
+            visited.push(key);
+            Ok::<_, Infallible>(())
+        };
+        match rising(known.iter().copied().collect(), range, next_from, visit) {
+            Ok(()) => (visited, asked),
+        }
+    }
+
+    #[test]
+    fn the_way_to_a_key_that_damage_has_put_far_away_is_short() {
+        let far = i64::MAX - 1_000_000;
+        let keys = (1..=500).chain(2_001..=2_100).chain([far]).collect();
+        let (found, asked) = visited(&keys, &[101..=200, 501..=2_000, 2_101..=far - 1], &[1, 48, far].into());
+        assert_eq!(found, (1..=100).chain(201..=500).chain(2_001..=2_100).chain([far]).collect::<Vec<_>>());
+        assert!(asked < 10_000, "{asked}");
+    }
+
+    proptest! {
+        /// Keys rise, none comes twice, all that are known come, and of the others those that read.
+        #[test]
+        fn what_reads_is_visited(
+            pages in vec((50_i64..200, any::<bool>()), 1..40),
+            known in proptest::collection::btree_set(1_i64..3_000, 0..20),
+        ) {
+            let (mut keys, mut broken, mut at) = (BTreeSet::new(), Vec::new(), 1);
+            for (length, reads) in pages {
+                let page = at..=at + length - 1;
+                if reads {
+                    keys.extend(page);
+                } else {
+                    broken.push(page);
+                }
+                at += length;
+            }
+            let mut expected: Vec<_> = keys.union(&known).copied().collect();
+            let limit = known.last().map_or(0, |last| last + BEYOND);
+            expected.retain(|key| known.contains(key) || *key <= limit);
+            let (found, _) = visited(&keys, &broken, &known);
+            prop_assert_eq!(found, expected);
+        }
     }
 }

@@ -13,7 +13,8 @@ use mutate::{Mutator, below};
 use rand_pcg::Pcg64Mcg;
 use std::{
     collections::HashSet,
-    fs,
+    fs::{self, File},
+    io::{self, Read as _},
     panic::{AssertUnwindSafe, catch_unwind},
     path::{Path, PathBuf},
     time::{Duration, Instant},
@@ -45,7 +46,12 @@ pub fn corpus_directory(target: &Target) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("data").join("fuzz").join(target.name)
 }
 
-/// The inputs that are kept, in the order of their names.
+/// What a run of `fuzz` has found that leads to code of its own, packed.
+fn archive(target: &Target) -> PathBuf {
+    corpus_directory(target).with_extension("tar.zst")
+}
+
+/// The inputs that are kept: seeds, those that failed once, in the order of their names, and what a long run has found.
 ///
 /// # Panics
 /// They do not read.
@@ -56,11 +62,34 @@ pub fn corpus(target: &Target) -> Vec<Vec<u8>> {
         files.sort();
         inputs.extend(files.iter().map(|file| fs::read(file).expect("an input")));
     }
+    if let Ok(packed) = File::open(archive(target)) {
+        let unpacked = zstd::Decoder::new(packed).expect("an archive");
+        for entry in tar::Archive::new(unpacked).entries().expect("an archive") {
+            let mut input = Vec::new();
+            entry.and_then(|mut entry| entry.read_to_end(&mut input)).expect("an input");
+            inputs.push(input);
+        }
+    }
     assert!(!inputs.is_empty(), "{}: no inputs", target.name);
     inputs
 }
 
-/// Reads mutated inputs. `meter` calls what it is given and tells how many bytes were held at its peak.
+/// Keeps what a long run has found, instead of what one before it had.
+///
+/// # Errors
+/// It cannot be written.
+pub fn keep_corpus(target: &Target, inputs: &[Vec<u8>]) -> io::Result<()> {
+    let mut archive = tar::Builder::new(zstd::Encoder::new(File::create(archive(target))?, 19)?);
+    for (number, input) in inputs.iter().enumerate() {
+        let mut header = tar::Header::new_ustar();
+        header.set_size(input.len() as u64);
+        header.set_mode(0o644);
+        archive.append_data(&mut header, format!("{number:05}"), &input[..])?;
+    }
+    archive.into_inner()?.finish()?.sync_all()
+}
+
+/// Reads the inputs that are kept, and so many that are mutated from them. `meter` calls what it is given and tells how many bytes were held at its peak.
 ///
 /// # Panics
 /// An execution panics, takes too long or too much memory; the input is written to the temporary directory.
@@ -70,7 +99,7 @@ pub fn run(target: &Target, executions: u64, seed: u64, mut meter: impl FnMut(&m
     let kept = pool.len();
     let mut seen = HashSet::new();
     let mut tally = Tally::default();
-    for execution in 0..executions {
+    for execution in 0..kept as u64 + executions {
         let input = match usize::try_from(execution) {
             Ok(first) if first < kept => pool[first].clone(),
             _ => mutator.mutate(&pool, target.max_bytes),

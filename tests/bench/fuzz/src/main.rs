@@ -10,7 +10,7 @@ use clap::Parser;
 use comfy_table::{CellAlignment, Table, presets};
 use mazeway_tests::{
     fuzz::{
-        SLOW, corpus, judge,
+        SLOW, corpus, judge, keep_corpus,
         targets::{TARGETS, Target, find},
     },
     memory,
@@ -46,12 +46,19 @@ struct Cli {
     /// Where corpora, logs and failing inputs are kept.
     #[arg(long, default_value = "target/fuzz", value_name = "DIR")]
     work: PathBuf,
+    /// Instead of fuzzing, put the fewest inputs of each corpus that reach all that it reaches into `tests/data/fuzz`, where
+    /// every run of the tests reads them and every further run of this program begins.
+    #[arg(long, conflicts_with_all = ["runs", "seed"])]
+    keep: bool,
 }
 
 fn target(name: &str) -> Result<Target, String> {
     let names = || TARGETS.map(|target| target.name).join(", ");
     find(name).copied().ok_or_else(|| format!("expected one of {}", names()))
 }
+
+/// What is wrong where libFuzzer says nothing.
+const UNGUIDED: &str = "built without libFuzzer: tests/bench/reliability.sh fuzz builds it";
 
 /// What libFuzzer has told at its end.
 struct Outcome {
@@ -69,6 +76,18 @@ fn main() -> ExitCode {
     }
     let cli = Cli::parse();
     let targets = if cli.targets.is_empty() { TARGETS.to_vec() } else { cli.targets };
+    if cli.keep {
+        for target in targets {
+            match keep(&target, &cli.work) {
+                Ok(inputs) => println!("{}: {inputs} inputs", target.name),
+                Err(error) => {
+                    eprintln!("error: {}: {error}", target.name);
+                    return ExitCode::FAILURE;
+                }
+            }
+        }
+        return ExitCode::SUCCESS;
+    }
     let mut table = Table::new();
     table.load_style(presets::ASCII_MARKDOWN);
     table.set_header(["target", "inputs", "edges", "corpus", "slowest, s", "process, MiB", "took, s"]);
@@ -107,18 +126,14 @@ fn read_inputs(target: &'static Target) {
 
 /// Runs a child on a target until it has read so many inputs.
 fn fuzz(target: &Target, runs: u64, seed: u32, work: &Path) -> Result<Outcome, String> {
-    let text = |error: io::Error| error.to_string();
     let kept = work.join("corpus").join(target.name);
-    let logs = work.join("logs");
-    for directory in [&kept, &logs] {
-        fs::create_dir_all(directory).map_err(text)?;
-    }
+    make_directory(&kept)?;
     for (number, input) in corpus(target).iter().enumerate() {
         fs::write(kept.join(format!("seed-{number:03}")), input).map_err(text)?;
     }
+    let logs = logs(work)?;
     let words = logs.join(format!("{}.dict", target.name));
     fs::write(&words, dictionary(target.words)).map_err(text)?;
-    let log = logs.join(format!("{}-{seed}.log", target.name));
     let arguments = [
         kept.display().to_string(),
         format!("-artifact_prefix={}/{}-", logs.display(), target.name),
@@ -131,22 +146,7 @@ fn fuzz(target: &Target, runs: u64, seed: u32, work: &Path) -> Result<Outcome, S
         "-reload=0".into(),
         "-print_final_stats=1".into(),
     ];
-    // A child ends without clearing up.
-    let temporary = memory();
-    let output = File::create(&log).map_err(text)?;
-    let status = Command::new(env::current_exe().map_err(text)?)
-        .env(TARGET, target.name)
-        .env(ARGUMENTS, arguments.join(" "))
-        .env("TMPDIR", temporary.path())
-        .stdout(output.try_clone().map_err(text)?)
-        .stderr(output)
-        .status()
-        .map_err(text)?;
-    let said = fs::read(&log).map_err(text)?;
-    let said = String::from_utf8_lossy(&said);
-    if !status.success() {
-        return Err(format!("{status}; see {}", log.display()));
-    }
+    let said = run_child(target, &arguments, &logs.join(format!("{}-{seed}.log", target.name)))?;
     let number = |name: &str| {
         let line = said.lines().rev().find_map(|line| line.split_once(name))?;
         line.1.split_whitespace().next()?.parse::<u64>().ok()
@@ -160,7 +160,66 @@ fn fuzz(target: &Target, runs: u64, seed: u32, work: &Path) -> Result<Outcome, S
             peak_mib: number("stat::peak_rss_mb:")?,
         })
     })();
-    told.ok_or_else(|| "built without libFuzzer: tests/bench/reliability.sh fuzz builds it".into())
+    told.ok_or_else(|| UNGUIDED.into())
+}
+
+/// Puts what is worth keeping of a corpus beside the tests, and says how many inputs that is.
+fn keep(target: &Target, work: &Path) -> Result<usize, String> {
+    let grown = work.join("corpus").join(target.name);
+    let fewest = work.join("fewest").join(target.name);
+    make_directory(&grown)?;
+    let _ = fs::remove_dir_all(&fewest);
+    make_directory(&fewest)?;
+    let arguments = [
+        "-merge=1".into(),
+        format!("-max_len={}", target.max_bytes),
+        fewest.display().to_string(),
+        grown.display().to_string(),
+    ];
+    run_child(target, &arguments, &logs(work)?.join(format!("{}-keep.log", target.name)))?;
+    let mut inputs = Vec::new();
+    for entry in fs::read_dir(&fewest).map_err(text)? {
+        inputs.push(fs::read(entry.map_err(text)?.path()).map_err(text)?);
+    }
+    if inputs.is_empty() {
+        return Err(UNGUIDED.into());
+    }
+    inputs.sort_by(|one, other| (one.len(), one).cmp(&(other.len(), other)));
+    keep_corpus(target, &inputs).map_err(text)?;
+    Ok(inputs.len())
+}
+
+/// Has a child of this program do with a target what libFuzzer is told, and gives what it said, which is logged.
+fn run_child(target: &Target, arguments: &[String], log: &Path) -> Result<String, String> {
+    // A child ends without clearing up.
+    let temporary = memory();
+    let output = File::create(log).map_err(text)?;
+    let status = Command::new(env::current_exe().map_err(text)?)
+        .env(TARGET, target.name)
+        .env(ARGUMENTS, arguments.join(" "))
+        .env("TMPDIR", temporary.path())
+        .stdout(output.try_clone().map_err(text)?)
+        .stderr(output)
+        .status()
+        .map_err(text)?;
+    if !status.success() {
+        return Err(format!("{status}; see {}", log.display()));
+    }
+    Ok(String::from_utf8_lossy(&fs::read(log).map_err(text)?).into_owned())
+}
+
+fn logs(work: &Path) -> Result<PathBuf, String> {
+    let logs = work.join("logs");
+    make_directory(&logs)?;
+    Ok(logs)
+}
+
+fn make_directory(path: &Path) -> Result<(), String> {
+    fs::create_dir_all(path).map_err(text)
+}
+
+fn text(error: io::Error) -> String {
+    error.to_string()
 }
 
 /// Pieces of a format as libFuzzer reads them.

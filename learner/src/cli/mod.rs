@@ -29,7 +29,6 @@ use mazeway_serving::{
     token_command::TokenArgs,
 };
 use std::{path::PathBuf, process::ExitCode, time::Duration};
-use tracing_subscriber::EnvFilter;
 
 /// Watches experts act and works out what they want.
 #[derive(Debug, Parser)]
@@ -168,8 +167,7 @@ pub fn main() -> ExitCode {
     };
     if !matches!(cli.command, Command::Serve(_)) {
         // What a service that was started for this command logs is told by the error and its hint.
-        let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("off"));
-        tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
+        tracing_subscriber::fmt().with_env_filter(logs::asked("off")).with_writer(std::io::stderr).init();
     }
     let runtime = match tokio::runtime::Builder::new_multi_thread().enable_all().build() {
         Ok(runtime) => runtime,

@@ -29,12 +29,27 @@ pub enum LogFormat {
     Json,
 }
 
+/// A filter as text.
+///
+/// # Errors
+/// It is none. The library cuts texts at bytes, which panics where they are not ASCII.
+fn parse(text: &str) -> Result<EnvFilter, String> {
+    let wrong = || "expected a level such as info, or levels of modules such as warn,mazeway_server=debug".into();
+    if text.trim().is_empty() || !text.is_ascii() {
+        return Err(wrong());
+    }
+    EnvFilter::builder().parse(text).map_err(|_| wrong())
+}
+
 /// Reads what `--log` takes.
 pub(super) fn filter(text: &str) -> Result<String, String> {
-    match EnvFilter::builder().parse(text) {
-        Ok(_) if !text.trim().is_empty() => Ok(text.into()),
-        _ => Err("expected a level such as info, or levels of modules such as warn,mazeway_server=debug".into()),
-    }
+    parse(text).map(|_| text.into())
+}
+
+/// What `RUST_LOG` says is logged, and `otherwise` where it says nothing that can be followed.
+pub fn asked(otherwise: &'static str) -> EnvFilter {
+    let asked = env::var(EnvFilter::DEFAULT_ENV).ok().and_then(|text| parse(&text).ok());
+    asked.unwrap_or_else(|| EnvFilter::new(otherwise))
 }
 
 /// Reads what `--otlp-endpoint` takes.
@@ -68,8 +83,8 @@ impl Spans {
 /// The collector's address serves for nothing.
 pub fn start(config: &TelemetryConfig, service: &'static str) -> io::Result<Spans> {
     let filter = match &config.log {
-        Some(filter) => EnvFilter::builder().parse(filter).map_err(io::Error::other)?,
-        None => EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("warn")),
+        Some(filter) => parse(filter).map_err(io::Error::other)?,
+        None => asked("warn"),
     };
     // Colours are for eyes; a file or a collector would keep their codes.
     let coloured = io::stderr().is_terminal() && env::var_os("NO_COLOR").is_none_or(|value| value.is_empty());
@@ -105,7 +120,7 @@ mod tests {
         for right in ["info", "warn,mazeway_server=debug", "off"] {
             assert_eq!(filter(right).as_deref(), Ok(right));
         }
-        for wrong in ["", " ", "mazeway=loud", "=="] {
+        for wrong in ["", " ", "mazeway=loud", "==", "\u{2008}0=", "größe=info"] {
             assert!(filter(wrong).is_err(), "{wrong}");
         }
         assert!(endpoint("http://127.0.0.1:4317").is_ok());

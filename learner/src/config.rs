@@ -1,7 +1,6 @@
 //! Settings of the learner service: where it keeps its data, limits and times.
 
-use mazeway_serving::DoorConfig;
-use mazeway_serving::config::count;
+use mazeway_serving::{DoorConfig, config::count};
 use std::{ops::RangeInclusive, path::PathBuf, time::Duration};
 
 /// Everything that a learner service can be told.

@@ -34,12 +34,18 @@ async fn lists(service: &mut Service) -> bool {
     service.list_environments(pb::ListEnvironmentsRequest {}).await.is_ok()
 }
 
+/// A server, and a call to it that takes long.
+async fn with_long_call(door: DoorConfig) -> (EnvServer, Service, pb::CreateSessionRequest) {
+    let server = EnvServer::with(Config { door, max_envs_per_session: 65_536, ..config() });
+    let service = service(&server).await;
+    let large = pb::CreateSessionRequest { env_id: "Highway-v0".into(), num_envs: 65_536, ..Default::default() };
+    (server, service, large)
+}
+
 #[tokio::test]
 async fn a_call_that_asks_for_no_deadline_has_one() {
     let door = DoorConfig { call_deadline: Duration::from_millis(1), ..DoorConfig::default() };
-    let server = EnvServer::with(Config { door, max_envs_per_session: 65_536, ..config() });
-    let mut service = service(&server).await;
-    let large = pb::CreateSessionRequest { env_id: "Highway-v0".into(), num_envs: 65_536, ..Default::default() };
+    let (_server, mut service, large) = with_long_call(door).await;
     let status = service.create_session(large).await.expect_err("it takes longer");
     assert_eq!(status.code(), Code::DeadlineExceeded, "{status}");
     // A stream has the deadline that it asks for, and none otherwise.
@@ -61,9 +67,7 @@ async fn a_call_that_asks_for_no_deadline_has_one() {
 #[tokio::test]
 async fn a_deadline_is_cut_to_the_longest_there_is() {
     let door = DoorConfig { max_call_deadline: Duration::from_millis(1), ..DoorConfig::default() };
-    let server = EnvServer::with(Config { door, max_envs_per_session: 65_536, ..config() });
-    let mut service = service(&server).await;
-    let large = pb::CreateSessionRequest { env_id: "Highway-v0".into(), num_envs: 65_536, ..Default::default() };
+    let (_server, mut service, large) = with_long_call(door).await;
     let mut request = Request::new(large);
     request.set_timeout(Duration::from_hours(1));
     let status = service.create_session(request).await.expect_err("it takes longer");

@@ -48,8 +48,8 @@ pub struct Settings {
     file: Option<PathBuf>,
     /// Keys that it has.
     from_file: Vec<String>,
-    /// Variables that look like settings and are none, each with what it may have meant.
-    strangers: Vec<String>,
+    /// What begins the name of every variable.
+    prefix: String,
 }
 
 /// Where the flags of a service are: at the command itself, or at a command below it.
@@ -72,10 +72,15 @@ pub fn parse(
     let below = matches.subcommand_name().and_then(|name| places.iter().flatten().find(|place| **place == name));
     let own = |command: &Command| below.map_or(command.clone(), |name| subcommand(command, name));
     let flags = below.map_or(Some(&matches), |name| matches.subcommand_matches(name));
-    let strangers = strangers(&own(&command), prefix, std::env::vars_os().map(|(name, _)| name));
     let asked = flags.and_then(|flags| flags.try_get_one::<PathBuf>("config").ok().flatten()).cloned();
     let Some(path) = asked else {
-        return Ok(Settings { command: own(&command), matches, file: None, from_file: Vec::new(), strangers });
+        return Ok(Settings {
+            command: own(&command),
+            matches,
+            file: None,
+            from_file: Vec::new(),
+            prefix: prefix.into(),
+        });
     };
     let read = read(&path).and_then(|text| values(&text, &own(&command)));
     let values = read.map_err(|message| SettingsError::File { path: path.clone(), message })?;
@@ -91,7 +96,7 @@ pub fn parse(
         None => with_defaults(command),
     };
     let matches = command.clone().try_get_matches_from(&args).map_err(usage)?;
-    Ok(Settings { command: own(&command), matches, file: Some(path), from_file, strangers })
+    Ok(Settings { command: own(&command), matches, file: Some(path), from_file, prefix: prefix.into() })
 }
 
 /// The command with a variable for every flag.
@@ -243,10 +248,15 @@ impl Settings {
         }
     }
 
+    /// Variables that look like settings and are none, each with what it may have meant.
+    fn strangers(&self) -> Vec<String> {
+        strangers(&self.command, &self.prefix, std::env::vars_os().map(|(name, _)| name))
+    }
+
     /// Logs a warning of every variable that looks like a setting and is none: not an error, since others may set variables
     /// that begin alike, as Kubernetes does for a service of such a name.
     pub fn warn_of_strangers(&self) {
-        for stranger in &self.strangers {
+        for stranger in self.strangers() {
             tracing::warn!("there is no setting {stranger}");
         }
     }
@@ -255,7 +265,7 @@ impl Settings {
     pub fn effective(&self) -> String {
         let flags = self.flags();
         let mut text = String::new();
-        for stranger in &self.strangers {
+        for stranger in self.strangers() {
             let _ = writeln!(text, "# there is no setting {stranger}\n");
         }
         for (long, arg) in settings(&self.command) {

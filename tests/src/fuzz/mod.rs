@@ -89,7 +89,8 @@ pub fn keep_corpus(target: &Target, inputs: &[Vec<u8>]) -> io::Result<()> {
     archive.into_inner()?.finish()?.sync_all()
 }
 
-/// Reads the inputs that are kept, and so many that are mutated from them. `meter` calls what it is given and tells how many bytes were held at its peak.
+/// Reads the inputs that are kept, and so many that are mutated from them. `meter` calls what it is given and tells how many
+/// bytes were held at its peak.
 ///
 /// # Panics
 /// An execution panics, takes too long or too much memory; the input is written to the temporary directory.

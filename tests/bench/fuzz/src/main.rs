@@ -126,11 +126,7 @@ fn read_inputs(target: &'static Target) {
 
 /// Runs a child on a target until it has read so many inputs.
 fn fuzz(target: &Target, runs: u64, seed: u32, work: &Path) -> Result<Outcome, String> {
-    let kept = work.join("corpus").join(target.name);
-    make_directory(&kept)?;
-    for (number, input) in corpus(target).iter().enumerate() {
-        fs::write(kept.join(format!("seed-{number:03}")), input).map_err(text)?;
-    }
+    let kept = grown(target, work)?;
     let logs = logs(work)?;
     let words = logs.join(format!("{}.dict", target.name));
     fs::write(&words, dictionary(target.words)).map_err(text)?;
@@ -165,9 +161,8 @@ fn fuzz(target: &Target, runs: u64, seed: u32, work: &Path) -> Result<Outcome, S
 
 /// Puts what is worth keeping of a corpus beside the tests, and says how many inputs that is.
 fn keep(target: &Target, work: &Path) -> Result<usize, String> {
-    let grown = work.join("corpus").join(target.name);
+    let grown = grown(target, work)?;
     let fewest = work.join("fewest").join(target.name);
-    make_directory(&grown)?;
     let _ = fs::remove_dir_all(&fewest);
     make_directory(&fewest)?;
     let arguments = [
@@ -187,6 +182,16 @@ fn keep(target: &Target, work: &Path) -> Result<usize, String> {
     inputs.sort_by(|one, other| (one.len(), one).cmp(&(other.len(), other)));
     keep_corpus(target, &inputs).map_err(text)?;
     Ok(inputs.len())
+}
+
+/// Where a corpus grows: what is kept beside the tests and what runs here have found.
+fn grown(target: &Target, work: &Path) -> Result<PathBuf, String> {
+    let grown = work.join("corpus").join(target.name);
+    make_directory(&grown)?;
+    for (number, input) in corpus(target).iter().enumerate() {
+        fs::write(grown.join(format!("seed-{number:03}")), input).map_err(text)?;
+    }
+    Ok(grown)
 }
 
 /// Has a child of this program do with a target what libFuzzer is told, and gives what it said, which is logged.

@@ -50,7 +50,13 @@ impl Peers {
     fn start() -> Self {
         let data = memory();
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().expect("a runtime");
-        let limits = Config { max_envs_per_session: 64, max_sessions: 100_000, max_total_envs: 1_000_000, ..config() };
+        let limits = Config {
+            max_envs_per_session: 64,
+            max_sessions: 100_000,
+            max_total_envs: 1_000_000,
+            max_rollout_steps: 1_000_000,
+            ..config()
+        };
         let server = EnvServer::with(Config { threads: 1, ..limits });
         let learner = LearnerServer::with(data.path(), Limits { max_fit_iterations: 100, ..Limits::default() });
         let (environments, of_learner) = runtime.block_on(async {

@@ -1,6 +1,9 @@
 //! Settings of the learner service: where it keeps its data, limits and times.
 
-use mazeway_serving::{DoorConfig, config::count};
+use mazeway_serving::{
+    DoorConfig,
+    config::{count, seconds},
+};
 use std::{ops::RangeInclusive, path::PathBuf, time::Duration};
 
 /// Everything that a learner service can be told.
@@ -50,8 +53,9 @@ pub struct Limits {
     /// Models that are taken in or given out at a time; further ones wait their turn
     #[arg(long, default_value_t = 2, value_parser = count(1..=1024), value_name = "N")]
     pub max_concurrent_models: usize,
-    /// Time for which the other end of a model's stream may do nothing; it has to keep up 64 KiB a second in the long run
-    #[arg(long, default_value = "30s", value_parser = duration, value_name = "TIME")]
+    /// Time for which the other end of a model's stream may do nothing, in seconds; it has to keep up 64 KiB a second in the
+    /// long run
+    #[arg(long = "model-patience-secs", default_value = "30", value_parser = seconds, value_name = "SECS")]
     pub model_patience: Duration,
     /// Fits that run at a time; further ones wait their turn
     #[arg(long, default_value_t = 2, value_parser = count(1..=1024), value_name = "N")]
@@ -65,11 +69,11 @@ pub struct Limits {
     /// Calls and streams of one connection at a time
     #[arg(long, default_value_t = 256, value_parser = clap::value_parser!(u32).range(1..), value_name = "N")]
     pub max_streams_per_connection: u32,
-    /// Time between HTTP/2 pings that find out whether a silent peer is still there
-    #[arg(long, default_value = "10s", value_parser = duration, value_name = "TIME")]
+    /// Time between HTTP/2 pings that find out whether a silent peer is still there, in seconds
+    #[arg(long = "keepalive-secs", default_value = "10", value_parser = seconds, value_name = "SECS")]
     pub keepalive: Duration,
-    /// Time that running calls have to end when the service is told to stop
-    #[arg(long, default_value = "10s", value_parser = duration, value_name = "TIME")]
+    /// Time that running calls have to end once the service is told to stop, in seconds
+    #[arg(long = "shutdown-grace-secs", default_value = "10", value_parser = seconds, value_name = "SECS")]
     pub shutdown_grace: Duration,
 }
 
@@ -98,16 +102,6 @@ impl Default for Limits {
 
 /// Bytes that a message may have at most: enough for any call without an array, and no more than gRPC can count.
 const MESSAGE_BYTES: RangeInclusive<u64> = 1024..=i32::MAX as u64;
-
-/// Longest time that any setting may be.
-const LONGEST: Duration = Duration::from_hours(365 * 24);
-
-fn duration(text: &str) -> Result<Duration, String> {
-    match humantime::parse_duration(text) {
-        Ok(duration) if !duration.is_zero() && duration <= LONGEST => Ok(duration),
-        _ => Err("expected a time above 0 and up to a year, with its unit, such as 10s or 2m".into()),
-    }
-}
 
 #[cfg(test)]
 mod tests {

@@ -122,9 +122,9 @@ fn numbers_out_of_bounds_are_refused_wherever_they_come_from() {
         ("max-queued-fits", &most),
         ("max-streams-per-connection", "0"),
         ("max-trajectories-per-request", "0"),
-        ("keepalive", "1000000years"),
-        ("shutdown-grace", "0s"),
-        ("model-patience", "0s"),
+        ("keepalive-secs", "1e12"),
+        ("shutdown-grace-secs", "0"),
+        ("model-patience-secs", "0"),
     ];
     for (program, prefix, own) in
         [("server", "MAZEWAY_SERVER_", &of_server[..]), ("learner", "MAZEWAY_LEARNER_", &of_learner[..])]

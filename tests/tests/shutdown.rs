@@ -254,7 +254,7 @@ async fn endless(learner: &Learner) -> (String, learner_pb::FitRequest) {
 async fn whoever_waits_for_a_learner_that_stops_hears_of_it() {
     let data = tempfile::tempdir().expect("a directory");
     let mut command = Command::new(program("learner"));
-    command.args(["serve", "--listen", "127.0.0.1:0", "--shutdown-grace", "4s", "--max-concurrent-fits", "1"]);
+    command.args(["serve", "--listen", "127.0.0.1:0", "--shutdown-grace-secs", "4", "--max-concurrent-fits", "1"]);
     let mut service = Program::start(command.arg("--data").arg(data.path()));
     let learner = Learner::connect(&service.address).await.expect("connects");
     let (model_id, fit) = endless(&learner).await;

@@ -641,7 +641,7 @@ async fn a_service_says_when_it_begins_and_ends_and_no_health_stream_holds_it_up
         Shown::server(&["--log", "info", "--shutdown-grace-secs", "20", "--tokens", tokens.to_str().expect("a path")]);
     let data = tempfile::tempdir().expect("a directory");
     let mut command = Command::new(program("learner"));
-    command.args(["serve", "--log", "info", "--shutdown-grace", "20s", "--data"]).arg(data.path());
+    command.args(["serve", "--log", "info", "--shutdown-grace-secs", "20", "--data"]).arg(data.path());
     let learner = Shown::start(command);
     for (shown, auth) in [(server, "tokens"), (learner, "nobody")] {
         let address = shown.address.clone();

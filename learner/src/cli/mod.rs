@@ -29,6 +29,7 @@ use mazeway_serving::{
     token_command::TokenArgs,
 };
 use std::{path::PathBuf, process::ExitCode, time::Duration};
+use tracing_subscriber::{Layer as _, filter::LevelFilter, layer::SubscriberExt as _, util::SubscriberInitExt as _};
 
 /// Watches experts act and works out what they want.
 #[derive(Debug, Parser)]
@@ -167,7 +168,8 @@ pub fn main() -> ExitCode {
     };
     if !matches!(cli.command, Command::Serve(_)) {
         // What a service that was started for this command logs is told by the error and its hint.
-        tracing_subscriber::fmt().with_env_filter(logs::asked("off")).with_writer(std::io::stderr).init();
+        let writing = tracing_subscriber::fmt::layer().with_writer(std::io::stderr);
+        tracing_subscriber::registry().with(writing.with_filter(logs::asked(LevelFilter::OFF))).init();
     }
     let runtime = match tokio::runtime::Builder::new_multi_thread().enable_all().build() {
         Ok(runtime) => runtime,

@@ -2,14 +2,15 @@
 //!
 //! Structure is SQLite's: its `integrity_check` looks at pages, order of keys and indices. Contents are ours: a trajectory
 //! is checked against the SHA-256 that it was stored with, a model against its id, which is its SHA-256, a fit against the SHA-256
-//! in its document.
+//! in its document, and what lists tell of it against that document, of which it is made.
 //! Rows are read one by one, by every key that any index or the table itself still tells, so that a page that does not
 //! read costs the rows that lie on it and no others.
 
 use super::{
     Arrays, Collection, Model, Recording, StoreError,
     filter::stored_uuid,
-    fits, models,
+    fits::{self, StoredFit},
+    models,
     packing::{torn, unpack},
     room::Room,
     schema,
@@ -124,8 +125,8 @@ pub enum Sound<'a> {
     Trajectory { seq: i64, recorded_at_us: i64, recording: &'a Recording },
     /// A model and when it was stored.
     Model { stored_at_us: i64, model: &'a Model },
-    /// A fit, by its row.
-    Fit { row: i64 },
+    /// A fit.
+    Fit(&'a StoredFit),
 }
 
 /// Reads everything that a store holds and checks it. A service may be at work on it meanwhile. Blocks.
@@ -155,7 +156,7 @@ pub fn sound_trajectories<E: From<StoreError>>(
     };
     walk(&connection, &path, |sound| match sound {
         Sound::Trajectory { recording, .. } => visit(recording),
-        Sound::Model { .. } | Sound::Fit { .. } => Ok(()),
+        Sound::Model { .. } | Sound::Fit(_) => Ok(()),
     })
 }
 
@@ -243,9 +244,13 @@ pub(super) fn walk<E: From<StoreError>>(
     })?;
     Keys::new(&snapshot, "fits", "seq", &["fits_by_env"], whole).try_for_each(|key| {
         match fits::by_row(&snapshot, path, key) {
-            Ok(Some(_)) => {
-                visit(Sound::Fit { row: key })?;
+            Ok(Some(stored)) => {
+                visit(Sound::Fit(&stored))?;
                 found.count(Kind::Fit, Ok(()));
+                if !stored.is_listed_rightly && found.structure.len() < MAX_FINDINGS as usize {
+                    let message = "what lists tell of it is not what its document says";
+                    found.structure.push(format!("fit {}: {message}", stored.fit.fit_id));
+                }
             }
             Ok(None) => {
                 found.count(Kind::Fit, Err((format!("row {key}"), damaged("fit", "its row is missing"))));

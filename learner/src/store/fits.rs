@@ -46,6 +46,46 @@ pub struct FitInfo {
     pub agreement: f64,
 }
 
+/// The columns of a [`FitInfo`], in its order.
+const LISTED: &str =
+    "seq, fit_id, created_at, env_id, style, method, model_id, trajectories, stopped, iterations, agreement";
+
+impl FitInfo {
+    /// Of a fit in its place, as its document tells.
+    fn of(seq: i64, fit: &pb::Fit) -> Self {
+        let created = fit.created_at.unwrap_or_default();
+        Self {
+            seq,
+            fit_id: fit.fit_id.clone(),
+            created_at_us: created.seconds.saturating_mul(1_000_000).saturating_add(i64::from(created.nanos / 1000)),
+            env_id: fit.env_id.clone(),
+            style: fit.style.clone(),
+            method: fit.request.as_ref().map_or_else(String::new, |request| request.method.clone()),
+            model_id: fit.model_id.clone(),
+            trajectories: u32::try_from(fit.trajectories).unwrap_or(u32::MAX),
+            stopped: fit.stopped,
+            iterations: fit.iterations,
+            agreement: fit.agreement,
+        }
+    }
+
+    fn read(row: &Row<'_>) -> rusqlite::Result<Self> {
+        Ok(Self {
+            seq: row.get(0)?,
+            fit_id: row.get(1)?,
+            created_at_us: row.get(2)?,
+            env_id: row.get(3)?,
+            style: row.get(4)?,
+            method: row.get(5)?,
+            model_id: row.get(6)?,
+            trajectories: row.get(7)?,
+            stopped: row.get(8)?,
+            iterations: row.get(9)?,
+            agreement: row.get(10)?,
+        })
+    }
+}
+
 /// A document of the version that held the ids.
 #[derive(Clone, PartialEq, prost::Message)]
 struct OldDocument {
@@ -59,32 +99,55 @@ pub(super) fn insert(
     path: &Path,
     fit: &mut pb::Fit,
     ids: &mut IdList,
-    created_at_us: i64,
 ) -> Result<(), StoreError> {
-    let fail = |e: rusqlite::Error| StoreError::from_sqlite(path, &e);
     ids.describe(fit);
-    let row = connection
-        .prepare_cached(
-            "INSERT INTO fits (fit_id, created_at, env_id, style, method, model_id, trajectories, stopped, iterations, \
-             agreement, document) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
-        )
-        .and_then(|mut statement| {
-            statement.insert(params![
-                fit.fit_id,
-                created_at_us,
-                fit.env_id,
-                fit.style,
-                fit.request.as_ref().map_or("", |request| request.method.as_str()),
-                fit.model_id,
-                fit.trajectories as i64,
-                fit.stopped,
-                fit.iterations,
-                fit.agreement,
-                encode(fit),
-            ])
-        })
-        .map_err(fail)?;
+    let row = write_row(connection, None, fit, &encode(fit)).map_err(|e| StoreError::from_sqlite(path, &e))?;
     ids.write(connection, path, row)
+}
+
+/// Writes the row of a fit, in the next place or the one given, and tells which.
+fn write_row(connection: &Connection, seq: Option<i64>, fit: &pb::Fit, document: &[u8]) -> rusqlite::Result<i64> {
+    let info = FitInfo::of(0, fit);
+    let sql = format!("INSERT INTO fits ({LISTED}, document) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)");
+    connection.prepare_cached(&sql)?.insert(params![
+        seq,
+        info.fit_id,
+        info.created_at_us,
+        info.env_id,
+        info.style,
+        info.method,
+        info.model_id,
+        info.trajectories,
+        info.stopped,
+        info.iterations,
+        info.agreement,
+        document,
+    ])
+}
+
+/// Takes a fit over from another store, with the ids of its trajectories where they lie on pages.
+pub(super) fn take_over(
+    old: &Connection,
+    old_path: &Path,
+    new: &Connection,
+    new_path: &Path,
+    stored: &StoredFit,
+) -> Result<(), StoreError> {
+    let read = |e: rusqlite::Error| StoreError::from_sqlite(old_path, &e);
+    let write = |e: rusqlite::Error| StoreError::from_sqlite(new_path, &e);
+    let StoredFit { row, fit, document, .. } = stored;
+    write_row(new, Some(*row), fit, document).map_err(write)?;
+    if document.first() == Some(&WITH_IDS) {
+        return unfold(new, *row).map_err(write);
+    }
+    let sql = "SELECT page, ids FROM fit_trajectories WHERE fit = ? ORDER BY page";
+    let mut statement = old.prepare_cached(sql).map_err(read)?;
+    let mut pages = statement.query([row]).map_err(read)?;
+    while let Some(page) = pages.next().map_err(read)? {
+        let (page, ids) = page.get(0).and_then(|number| Ok((number, page.get::<_, Vec<u8>>(1)?))).map_err(read)?;
+        write_page(new, *row, page, &ids).map_err(write)?;
+    }
+    Ok(())
 }
 
 fn encode(fit: &pb::Fit) -> Vec<u8> {
@@ -158,7 +221,7 @@ pub(super) fn unfold_all(connection: &Connection) -> rusqlite::Result<()> {
 }
 
 /// As [`unfold_all`], of one row.
-pub(super) fn unfold(connection: &Connection, row: i64) -> rusqlite::Result<()> {
+fn unfold(connection: &Connection, row: i64) -> rusqlite::Result<()> {
     let old = stored(connection, row)?;
     let (Ok(fit), Ok(Some(ids))) = (decode(&old), old_ids(&old)) else { return Ok(()) };
     for (page, ids) in ids.chunks(IDS_A_PAGE).enumerate() {
@@ -169,8 +232,20 @@ pub(super) fn unfold(connection: &Connection, row: i64) -> rusqlite::Result<()> 
     Ok(())
 }
 
+/// A fit that is what was stored.
+#[derive(Debug)]
+pub struct StoredFit {
+    /// Its row.
+    row: i64,
+    /// What its document says.
+    pub(super) fit: pb::Fit,
+    document: Bytes,
+    /// Whether lists tell of it what its document says.
+    pub(super) is_listed_rightly: bool,
+}
+
 /// Reads the fit of a row, and checks that it is what the row says and that its trajectories are those that it was made of.
-pub(super) fn by_row(connection: &Connection, path: &Path, seq: i64) -> Result<Option<pb::Fit>, StoreError> {
+pub(super) fn by_row(connection: &Connection, path: &Path, seq: i64) -> Result<Option<StoredFit>, StoreError> {
     let fail = |e: rusqlite::Error| StoreError::from_sqlite(path, &e);
     let found = connection.query_row("SELECT fit_id FROM fits WHERE seq = ?", [seq], |row| row.get::<_, String>(0));
     let Some(fit_id) = found.optional().map_err(fail)? else { return Ok(None) };
@@ -178,6 +253,9 @@ pub(super) fn by_row(connection: &Connection, path: &Path, seq: i64) -> Result<O
     let fit = decode(&document).map_err(|message| corrupt(&fit_id, message))?;
     if fit.fit_id != fit_id {
         return Err(corrupt(&fit_id, "its document is that of another fit"));
+    }
+    if fit.agreement.is_nan() {
+        return Err(corrupt(&fit_id, "its agreement is no number"));
     }
     if document.first() != Some(&WITH_IDS) {
         let mut tally = Tally::default();
@@ -192,7 +270,11 @@ pub(super) fn by_row(connection: &Connection, path: &Path, seq: i64) -> Result<O
             return Err(corrupt(&fit_id, "the ids of its trajectories are not what was stored: the digests differ"));
         }
     }
-    Ok(Some(fit))
+    // What is listed is made of the document, and can be made anew.
+    let sql = format!("SELECT {LISTED} FROM fits WHERE seq = ?");
+    let listed = connection.prepare_cached(&sql).and_then(|mut s| s.query_row([seq], FitInfo::read));
+    let is_listed_rightly = listed.is_ok_and(|listed| listed == FitInfo::of(seq, &fit));
+    Ok(Some(StoredFit { row: seq, fit, document, is_listed_rightly }))
 }
 
 /// The ids of a fit's trajectories from the one of rank `after` on, at most `limit`.
@@ -227,26 +309,11 @@ pub(super) fn list(
     before: i64,
     limit: u32,
 ) -> rusqlite::Result<Vec<FitInfo>> {
-    let mut statement = connection.prepare(
-        "SELECT seq, fit_id, created_at, env_id, style, method, model_id, trajectories, stopped, iterations, agreement \
-         FROM fits WHERE (?1 = '' OR env_id = ?1) AND (?2 = '' OR style = ?2) AND seq < ?3 ORDER BY seq DESC LIMIT ?4",
-    )?;
-    let info = |row: &Row<'_>| {
-        Ok(FitInfo {
-            seq: row.get(0)?,
-            fit_id: row.get(1)?,
-            created_at_us: row.get(2)?,
-            env_id: row.get(3)?,
-            style: row.get(4)?,
-            method: row.get(5)?,
-            model_id: row.get(6)?,
-            trajectories: row.get(7)?,
-            stopped: row.get(8)?,
-            iterations: row.get(9)?,
-            agreement: row.get(10)?,
-        })
-    };
-    statement.query_map(params![env_id, style, before, limit], info)?.collect()
+    let mut statement = connection.prepare(&format!(
+        "SELECT {LISTED} FROM fits WHERE (?1 = '' OR env_id = ?1) AND (?2 = '' OR style = ?2) AND seq < ?3 \
+         ORDER BY seq DESC LIMIT ?4"
+    ))?;
+    statement.query_map(params![env_id, style, before, limit], FitInfo::read)?.collect()
 }
 
 /// Deletes a fit by its whole id and says whether there was one.

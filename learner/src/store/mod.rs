@@ -240,7 +240,7 @@ impl Store {
         let job = move |work: &mut writer::Work<'_>| {
             let now = now_us();
             fit.created_at = Some(timestamp(now));
-            fits::insert(work.connection, work.path, &mut fit, &mut ids, now)?;
+            fits::insert(work.connection, work.path, &mut fit, &mut ids)?;
             Ok(fit)
         };
         self.0.writer.queue(job).await?.committed().await

@@ -9,7 +9,7 @@ use super::{
     check::{Sound, walk},
     fits, models, schema, trajectories,
 };
-use rusqlite::{Connection, params, params_from_iter, types::Value};
+use rusqlite::{Connection, params};
 use std::{
     fs, io,
     path::{Path, PathBuf},
@@ -69,7 +69,6 @@ fn take_over(old: &Connection, path: &Path, new: &Connection, new_path: &Path) -
     let fail = |e: rusqlite::Error| StoreError::from_sqlite(new_path, &e);
     let transaction = new.unchecked_transaction().map_err(fail)?;
     let mut collections = trajectories::CollectionCache::new();
-    let has_pages = old.prepare("SELECT 1 FROM fit_trajectories").is_ok();
     let found = walk(old, path, |sound| match sound {
         Sound::Trajectory { seq, recorded_at_us, recording } => {
             if !trajectories::insert(&transaction, new_path, &mut collections, recording, 0)? {
@@ -84,42 +83,11 @@ fn take_over(old: &Connection, path: &Path, new: &Connection, new_path: &Path) -
             let sql = "UPDATE models SET stored_at = ? WHERE model_id = ?";
             transaction.execute(sql, params![stored_at_us, model.model_id()]).map(drop).map_err(fail)
         }
-        Sound::Fit { row } => {
-            copy_rows(old, path, &transaction, new_path, "fits", "seq", row)?;
-            // An old document holds the ids itself.
-            if has_pages {
-                copy_rows(old, path, &transaction, new_path, "fit_trajectories", "fit", row)?;
-            }
-            fits::unfold(&transaction, row).map_err(fail)
-        }
+        Sound::Fit(stored) => fits::take_over(old, path, &transaction, new_path, stored),
     })?;
     allowance::copy(old, &transaction).map_err(fail)?;
     transaction.commit().map_err(fail)?;
     Ok(found)
-}
-
-/// Copies the rows of a table whose key has a value, all columns as they are.
-fn copy_rows(
-    old: &Connection,
-    path: &Path,
-    new: &Connection,
-    new_path: &Path,
-    table: &str,
-    key: &str,
-    value: i64,
-) -> Result<(), StoreError> {
-    let read = |e: rusqlite::Error| StoreError::from_sqlite(path, &e);
-    let write = |e: rusqlite::Error| StoreError::from_sqlite(new_path, &e);
-    let mut statement = old.prepare_cached(&format!("SELECT * FROM {table} WHERE {key} = ?")).map_err(read)?;
-    let names = statement.column_names().iter().map(|&name| name.to_owned()).collect::<Vec<_>>();
-    let places = vec!["?"; names.len()].join(", ");
-    let insert = format!("INSERT INTO {table} ({}) VALUES ({places})", names.join(", "));
-    let mut rows = statement.query([value]).map_err(read)?;
-    while let Some(row) = rows.next().map_err(read)? {
-        let values = (0..names.len()).map(|i| row.get::<_, Value>(i)).collect::<Result<Vec<_>, _>>().map_err(read)?;
-        new.execute(&insert, params_from_iter(values)).map_err(write)?;
-    }
-    Ok(())
 }
 
 /// Puts the new file in the place of the old one, which gets another name first: there is no moment without either.

@@ -422,3 +422,34 @@ fn a_repair_keeps_what_each_caller_has_recorded() {
     let refused = record(&store, simple(3, &[7, 8, 9]));
     assert!(matches!(refused, Err(StoreError::AllowanceSpent { .. })), "{refused:?}");
 }
+
+#[test]
+fn what_lists_tell_of_a_fit_is_checked_and_made_anew() {
+    let samples = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/data");
+    let copied = |name: &str| {
+        let directory = tempfile::tempdir().unwrap();
+        std::fs::copy(samples.join(format!("store_{name}.sqlite3")), directory.path().join(FILE_NAME)).unwrap();
+        directory
+    };
+    let fits = |directory: &Path| {
+        let store = Store::open(directory).unwrap();
+        let with_ids = |fit: FitInfo| (store.fit_trajectories(&fit.fit_id, 0, 1000).unwrap(), fit);
+        store.fits("", "", i64::MAX, 10).unwrap().into_iter().map(with_ids).collect::<Vec<_>>()
+    };
+    for name in ["v1", "v2", "v2_hashed"] {
+        let told = fits(copied(name).path());
+        assert!(!told.is_empty(), "{name}");
+        for damage in ["agreement = 0.125", "method = 'none'", "created_at = 1", "iterations = -1"] {
+            let directory = copied(name);
+            let file = Connection::open(directory.path().join(FILE_NAME)).unwrap();
+            file.execute(&format!("UPDATE fits SET {damage}"), []).unwrap();
+            drop(file);
+            let found = verify(directory.path()).unwrap();
+            assert!(!found.is_sound() && found.fits.damaged == 0, "{name}, {damage}: {found:?}");
+            assert!(found.structure[0].contains(&told[0].1.fit_id), "{found:?}");
+            let repaired = repair(directory.path()).unwrap();
+            assert!(repaired.kept.is_some() && repaired.found.fits.sound == told.len() as u64, "{repaired:?}");
+            assert_eq!(fits(directory.path()), told, "{name}, {damage}");
+        }
+    }
+}

@@ -24,6 +24,9 @@ use tonic::{Code, Request, Status, client::Grpc, codegen::http::uri::PathAndQuer
 const SESSION: &[u8; 32] = b"session-session-session-session-";
 /// Calls after which services begin anew, so that what was let in does not pile up.
 const CALLS: u32 = 200_000;
+/// Calls after which there is a new connection: a server ends one on which what comes too late for a call that it has refused, since
+/// they follow each other so fast, amounts to some hundred frames.
+const CALLS_OF_A_CONNECTION: u32 = 100;
 /// Messages of an answer that are read; of those who watch one, as they wait for the next.
 const READ: usize = 4;
 /// Time that an answer may take, on a machine that is busy.
@@ -41,8 +44,8 @@ struct Peers {
     session: String,
     world: String,
     calls: u32,
-    _server: EnvServer,
-    _learner: LearnerServer,
+    server: EnvServer,
+    learner_server: LearnerServer,
     _data: tempfile::TempDir,
 }
 
@@ -59,10 +62,7 @@ impl Peers {
         };
         let server = EnvServer::with(Config { threads: 1, ..limits });
         let learner = LearnerServer::with(data.path(), Limits { max_fit_iterations: 100, ..Limits::default() });
-        let (environments, of_learner) = runtime.block_on(async {
-            let channel = async |address: String| mazeway_client::channel(&address).await.expect("a channel");
-            (channel(server.address()).await, channel(learner.address()).await)
-        });
+        let (environments, of_learner) = connect(&runtime, &server, &learner);
         let mut peers = Self {
             runtime,
             environments,
@@ -70,8 +70,8 @@ impl Peers {
             session: String::new(),
             world: String::new(),
             calls: 0,
-            _server: server,
-            _learner: learner,
+            server,
+            learner_server: learner,
             _data: data,
         };
         let lease = Some(prost_types::Duration { seconds: 3600, nanos: 0 });
@@ -98,6 +98,10 @@ impl Peers {
         peers
     }
 
+    fn connect(&mut self) {
+        (self.environments, self.learner) = connect(&self.runtime, &self.server, &self.learner_server);
+    }
+
     /// The messages of the answer.
     fn ask(&self, path: &str, messages: Vec<Vec<u8>>) -> Result<Vec<Bytes>, Status> {
         let channel = if path.starts_with(LEARNER) { &self.learner } else { &self.environments };
@@ -120,6 +124,13 @@ impl Peers {
             timeout(PATIENCE, answer).await.expect("an answer in time")
         })
     }
+}
+
+fn connect(runtime: &Runtime, server: &EnvServer, learner: &LearnerServer) -> (Channel, Channel) {
+    runtime.block_on(async {
+        let channel = async |address: String| mazeway_client::channel(&address).await.expect("a channel");
+        (channel(server.address()).await, channel(learner.address()).await)
+    })
 }
 
 thread_local! {
@@ -150,6 +161,9 @@ fn tried(paths: &[(&str, &str)], bytes: &[u8]) -> Result<String, String> {
         }
         let peers = peers.get_or_insert_with(Peers::start);
         peers.calls += 1;
+        if peers.calls.is_multiple_of(CALLS_OF_A_CONNECTION) {
+            peers.connect();
+        }
         let message = replaced(message, if service == WORLDS { &peers.world } else { &peers.session });
         let messages = match (service, method) {
             (_, "Interact") => {

@@ -13,7 +13,10 @@ use std::{
     time::Duration,
 };
 use tracing_subscriber::{
-    EnvFilter, Layer as _, Registry, filter::filter_fn, layer::SubscriberExt as _, util::SubscriberInitExt as _,
+    Layer as _, Registry,
+    filter::{LevelFilter, Targets, filter_fn},
+    layer::SubscriberExt as _,
+    util::SubscriberInitExt as _,
 };
 
 /// Longest that the end of a program waits for spans on their way.
@@ -29,16 +32,19 @@ pub enum LogFormat {
     Json,
 }
 
-/// A filter as text.
+/// Levels of modules, comma-separated; one without a module is everybody's. Deliberately absent: conditions on spans and on
+/// values of fields, as the library's `EnvFilter` has them, whose expressions can take minutes and gigabytes to compile.
 ///
 /// # Errors
-/// It is none. The library cuts texts at bytes, which panics where they are not ASCII.
-fn parse(text: &str) -> Result<EnvFilter, String> {
-    let wrong = || "expected a level such as info, or levels of modules such as warn,mazeway_server=debug".into();
-    if text.trim().is_empty() || !text.is_ascii() {
-        return Err(wrong());
-    }
-    EnvFilter::builder().parse(text).map_err(|_| wrong())
+/// A part is neither. A word alone may be a module, of which everything is logged, but is more often a level misspelt.
+fn parse(text: &str) -> Result<Targets, String> {
+    let known = |part: &str| match part.split_once('=') {
+        Some((module, level)) => !module.is_empty() && !level.is_empty(),
+        None => !part.is_empty() && part.parse::<LevelFilter>().is_ok(),
+    };
+    let targets = if text.split(',').all(known) { text.parse().ok() } else { None };
+    targets
+        .ok_or_else(|| "expected a level such as info, or levels of modules such as warn,mazeway_server=debug".into())
 }
 
 /// Reads what `--log` takes.
@@ -46,10 +52,11 @@ pub(super) fn filter(text: &str) -> Result<String, String> {
     parse(text).map(|_| text.into())
 }
 
-/// What `RUST_LOG` says is logged, and `otherwise` where it says nothing that can be followed.
-pub fn asked(otherwise: &'static str) -> EnvFilter {
-    let asked = env::var(EnvFilter::DEFAULT_ENV).ok().and_then(|text| parse(&text).ok());
-    asked.unwrap_or_else(|| EnvFilter::new(otherwise))
+/// What `RUST_LOG` says is logged, a module alone being all of it, and `otherwise` where it says nothing that can be followed.
+pub fn asked(otherwise: LevelFilter) -> Targets {
+    let asked = env::var("RUST_LOG").ok().filter(|text| !text.trim().is_empty());
+    let asked = asked.and_then(|text| text.parse().ok());
+    asked.unwrap_or_else(|| Targets::new().with_default(otherwise))
 }
 
 /// Reads what `--otlp-endpoint` takes.
@@ -84,7 +91,7 @@ impl Spans {
 pub fn start(config: &TelemetryConfig, service: &'static str) -> io::Result<Spans> {
     let filter = match &config.log {
         Some(filter) => parse(filter).map_err(io::Error::other)?,
-        None => asked("warn"),
+        None => asked(LevelFilter::WARN),
     };
     // Colours are for eyes; a file or a collector would keep their codes.
     let coloured = io::stderr().is_terminal() && env::var_os("NO_COLOR").is_none_or(|value| value.is_empty());
@@ -117,10 +124,22 @@ mod tests {
 
     #[test]
     fn filters_and_endpoints_are_checked_before_anything_starts() {
-        for right in ["info", "warn,mazeway_server=debug", "off"] {
+        for right in ["info", "WARN,mazeway_server=debug", "off", "mazeway_server::grpc=trace,h2=off", "3"] {
             assert_eq!(filter(right).as_deref(), Ok(right));
         }
-        for wrong in ["", " ", "mazeway=loud", "==", "\u{2008}0=", "größe=info"] {
+        for wrong in [
+            "",
+            " ",
+            "inof",
+            "info,",
+            "mazeway=loud",
+            "=info",
+            "mazeway=",
+            "==",
+            "\u{2008}0=",
+            "[{a=.*}]",
+            "[{a=1}]=info",
+        ] {
             assert!(filter(wrong).is_err(), "{wrong}");
         }
         assert!(endpoint("http://127.0.0.1:4317").is_ok());

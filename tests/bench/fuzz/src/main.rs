@@ -203,6 +203,8 @@ fn run_child(target: &Target, arguments: &[String], log: &Path) -> Result<String
         .env(TARGET, target.name)
         .env(ARGUMENTS, arguments.join(" "))
         .env("TMPDIR", temporary.path())
+        // Each thread would keep memory of its own, which would be told as the process's.
+        .env("MALLOC_ARENA_MAX", "2")
         .stdout(output.try_clone().map_err(text)?)
         .stderr(output)
         .status()

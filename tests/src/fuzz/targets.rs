@@ -353,7 +353,7 @@ fn model_message(bytes: &[u8]) -> Result<String, String> {
 }
 
 /// A database: verified, or opened and read in every way; which of the two is up to its bytes, for most of the time goes into
-/// opening it. One in sixteen is verified, read and repaired.
+/// opening it. One in 64 is verified, read and repaired, which takes longer than all else.
 fn store_file(bytes: &[u8]) -> Result<String, String> {
     let directory = directory().join("store");
     fs::create_dir_all(&directory).expect("a directory");

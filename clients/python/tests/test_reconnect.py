@@ -290,6 +290,30 @@ def test_a_learner_that_comes_back_is_waited_for(tmp_path):
         learner.close()
 
 
+def test_what_is_not_repeated_can_be_called_again_at_once(tmp_path):
+    process = start_learner(tmp_path)
+    learner = mazeway.Learner(process.address)
+
+    def attempts(times):
+        """One call after the other, as a caller's own loop makes them: whether each was answered."""
+        for _ in range(times):
+            try:
+                learner.delete_trajectories(style="none")
+            except mazeway.ServerUnreachableError:
+                yield False
+            else:
+                yield True
+            time.sleep(0.3)
+
+    assert any(attempts(1))
+    process.stop()
+    assert not any(attempts(3))
+    process = start_learner(tmp_path, listen=process.address)
+    assert any(attempts(6))
+    learner.close()
+    process.stop()
+
+
 def test_a_server_that_was_never_there_is_not_waited_for():
     client, learner = mazeway.Client("127.0.0.1:1"), mazeway.Learner("127.0.0.1:1")
     for call in (

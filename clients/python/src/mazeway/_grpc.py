@@ -36,6 +36,9 @@ _FORK_WAIT_SECS = 5.0
 #: gRPC's own threads finish with a closed channel in the background; a fork comes so long after it.
 _FORK_REST_SECS = 0.05
 
+#: How long a call to a server that was not there waits for a connection first: see `_attend`.
+_ATTEND_SECS = 0.25
+
 
 class GrpcTransport:
     """The transport over grpcio."""
@@ -76,6 +79,8 @@ class GrpcTransport:
         #: True once the server has answered: from then on it is waited for when it goes away.
         self.known = False
         self._channel: Any = None
+        #: Whether the last that was heard of the channel is that the server is not there.
+        self._away = False
         self._callables: dict[str, Callable[..., Any]] = {}
         self._exchanges: weakref.WeakSet[_GrpcAnswers] = weakref.WeakSet()
         #: Held during a call, so that no fork comes between. Reentrant, for the garbage collector may
@@ -91,7 +96,7 @@ class GrpcTransport:
 
         def call(left: float) -> Any:
             with self._translated(timeout), self._lock:
-                return self._callable(method)(request, timeout=left)
+                return self._callable(method, left)(request, timeout=left)
 
         return repeated(self, method, call, timeout)
 
@@ -107,12 +112,12 @@ class GrpcTransport:
         """See `Transport`."""
         deadline = time.monotonic() + timeout
 
-        def begin(_left: float) -> tuple[contextlib.ExitStack, _GrpcAnswers, Any]:
+        def begin(left: float) -> tuple[contextlib.ExitStack, _GrpcAnswers, Any]:
             with contextlib.ExitStack() as stack:
                 stack.enter_context(self._counted())
                 with self._translated(timeout), self._lock:
                     whole = None if each else max(deadline - time.monotonic(), 0.0)
-                    call = self._callable(method)(request, timeout=whole)
+                    call = self._callable(method, left)(request, timeout=whole)
                     answers = _GrpcAnswers(self, call, timeout, watched=each, ask=alive)
                     if each:
                         self._exchanges.add(answers)
@@ -134,7 +139,7 @@ class GrpcTransport:
         def call(left: float) -> Any:
             with self._translated(timeout), self._counted():
                 with self._lock:
-                    made = self._callable(method)
+                    made = self._callable(method, left)
                 return made(iter(messages), timeout=left)
 
         return repeated(self, method, call, timeout)
@@ -142,7 +147,7 @@ class GrpcTransport:
     def exchange(self, method: str, *, timeout: float) -> Exchange:
         """See `Transport`."""
         with self._lock:
-            exchange = _GrpcExchange(self, self._callable(method), timeout, self._lock)
+            exchange = _GrpcExchange(self, self._callable(method, timeout), timeout, self._lock)
             self._exchanges.add(exchange)
             return exchange
 
@@ -172,6 +177,7 @@ class GrpcTransport:
         if self._channel is not None:
             self._channel.close()
             self._channel = None
+            self._away = False
             _forks.closed()
 
     @contextlib.contextmanager
@@ -186,6 +192,8 @@ class GrpcTransport:
         """The `MazewayError` that says what `error` says."""
         if error.code() is grpc.StatusCode.DEADLINE_EXCEEDED and _is_local_deadline(error):
             return late(self.address, timeout)
+        if error.code() is grpc.StatusCode.UNAVAILABLE:
+            self._away = True
         return from_status(
             error.code().value[0],
             error.details() or "",
@@ -203,13 +211,21 @@ class GrpcTransport:
         except ValueError as error:  # grpcio's word for a closed channel
             raise ServerUnreachableError(f"the connection to {self.address} is closed ({error})") from None
 
-    def _callable(self, name: str) -> Callable[..., Any]:
+    def _callable(self, name: str, within: float) -> Callable[..., Any]:
+        """What makes the call; the caller holds the lock.
+
+        Args:
+            name: Of the method.
+            within: Seconds that may pass until it returns.
+        """
         if self._channel is None:
             self._channel = (
                 grpc.secure_channel(self._target, self._tls(), self._options)
                 if self._secure
                 else grpc.insecure_channel(self._target, self._options)
             )
+        elif self._away:
+            self._attend(min(within, _ATTEND_SECS))
         if name not in self._callables:
             method = self._methods[name]
             kind = ("stream" if method.client_streaming else "unary") + (
@@ -225,6 +241,25 @@ class GrpcTransport:
                 call = functools.partial(call, metadata=metadata)
             self._callables[name] = call
         return self._callables[name]
+
+    def _attend(self, within: float) -> None:
+        """Waits until there is a connection, for so many seconds at most; the caller holds the lock.
+
+        gRPC's core, up to version 1.76 at least, learns what became of an attempt to connect only while
+        somebody waits on the channel. Calls fail at once while it does not know, so whoever calls again
+        and again would be told for ten seconds, or for ever, that a server that is back is not there.
+        """
+        ready = threading.Event()
+
+        def see(state: grpc.ChannelConnectivity) -> None:
+            if state is grpc.ChannelConnectivity.READY:
+                ready.set()
+
+        self._channel.subscribe(see, try_to_connect=True)
+        try:
+            self._away = not ready.wait(within)
+        finally:
+            self._channel.unsubscribe(see)
 
     def _tls(self) -> grpc.ChannelCredentials:
         files = self._credentials

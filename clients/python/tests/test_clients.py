@@ -232,6 +232,19 @@ print("grpc" in sys.modules)
 
 
 @pytest.mark.parametrize("client", CLIENTS)
+def test_a_program_ends_while_its_server_is_away(client):
+    code = """
+import sys, mazeway
+client = mazeway.Client("127.0.0.1:1", client=sys.argv[1])
+for _ in range(2):
+    try: client.model("Maze-v0")
+    except mazeway.ServerUnreachableError: pass
+"""
+    for _ in range(5):
+        assert python(code, client) == ""
+
+
+@pytest.mark.parametrize("client", CLIENTS)
 def test_a_program_ends_with_environments_open(server, client):
     code = """
 import sys, gymnasium, mazeway

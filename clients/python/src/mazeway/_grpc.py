@@ -36,6 +36,9 @@ _FORK_WAIT_SECS = 5.0
 #: gRPC's own threads finish with a closed channel in the background; a fork comes so long after it.
 _FORK_REST_SECS = 0.05
 
+#: What every server answers, one way or another: it may be asked without an effect.
+_HEALTH = "/grpc.health.v1.Health/Check"
+
 #: How long a call to a server that was not there waits for a connection first: see `_attend`.
 _ATTEND_SECS = 0.25
 
@@ -249,17 +252,14 @@ class GrpcTransport:
         somebody waits on the channel. Calls fail at once while it does not know, so whoever calls again
         and again would be told for ten seconds, or for ever, that a server that is back is not there.
         """
-        ready = threading.Event()
-
-        def see(state: grpc.ChannelConnectivity) -> None:
-            if state is grpc.ChannelConnectivity.READY:
-                ready.set()
-
-        self._channel.subscribe(see, try_to_connect=True)
+        ask = self._channel.unary_unary(_HEALTH)
         try:
-            self._away = not ready.wait(within)
-        finally:
-            self._channel.unsubscribe(see)
+            # Not `subscribe`: the thread that it leaves behind can keep an interpreter from ending.
+            ask(b"", timeout=within, wait_for_ready=True)
+        except grpc.RpcError as error:
+            self._away = error.code() in (grpc.StatusCode.DEADLINE_EXCEEDED, grpc.StatusCode.UNAVAILABLE)
+        else:
+            self._away = False
 
     def _tls(self) -> grpc.ChannelCredentials:
         files = self._credentials

@@ -164,7 +164,46 @@ async fn a_backup_of_a_service_at_work_opens_and_holds_what_was_acknowledged() {
     let place = copies.path().join("deep").join("0");
     let again = learner(&["backup", place.to_str().expect("a path")], data.path());
     assert_eq!(again.status.code(), Some(1));
-    assert!(complaint(&again).0.contains("already"), "{again:?}");
+    let (error, hint) = complaint(&again);
+    assert!(error.contains("already") && hint == "name another directory for the copy", "{again:?}");
+}
+
+#[cfg(unix)]
+#[tokio::test(flavor = "multi_thread")]
+async fn what_is_stored_stays_with_whom_it_belongs_to() {
+    use std::os::unix::fs::{MetadataExt as _, PermissionsExt as _};
+    let mode = |path: &Path| fs::metadata(path).expect("a file").mode() & 0o777;
+    let base = tempfile::tempdir().expect("a directory");
+    let (data, copies) = (base.path().join("deep/data"), base.path().join("copies/today"));
+    recorded(&data, 0..40).await;
+    for made in [base.path().join("deep"), data.clone()] {
+        assert_eq!(mode(&made), 0o700, "{}", made.display());
+    }
+    assert!(learner(&["vacuum"], &data).status.success());
+
+    let file = data.join("mazeway.sqlite3");
+    fs::set_permissions(&file, fs::Permissions::from_mode(0o600)).expect("permissions");
+    let copied = learner(&["backup", copies.to_str().expect("a path")], &data);
+    assert!(copied.status.success(), "{copied:?}");
+    assert_eq!((mode(&copies), mode(&copies.join("mazeway.sqlite3"))), (0o700, 0o600));
+
+    let mut bytes = fs::read(&file).expect("a database");
+    let victim = trajectory(31);
+    let at = bytes.windows(victim.rewards.len()).rposition(|w| w == victim.rewards).expect("its rewards");
+    bytes[at + 3] ^= 16;
+    fs::write(&file, &bytes).expect("a file");
+    // Only root may give files away: then it is somebody else's, as where root repairs what a service writes.
+    let owner = if std::os::unix::fs::chown(&file, Some(4321), Some(1234)).is_ok() {
+        (4321, 1234)
+    } else {
+        let own = fs::metadata(&file).expect("a file");
+        (own.uid(), own.gid())
+    };
+    let repaired = learner(&["repair"], &data);
+    assert!(repaired.status.success(), "{repaired:?}");
+    let new = fs::metadata(&file).expect("a file");
+    assert_eq!((new.mode() & 0o777, (new.uid(), new.gid())), (0o600, owner));
+    assert!(learner(&["verify"], &data).status.success());
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -87,6 +87,9 @@ impl From<ClientError> for CliError {
 impl From<StoreError> for CliError {
     fn from(error: StoreError) -> Self {
         let hint = match &error {
+            StoreError::Directory { kind: io::ErrorKind::PermissionDenied, .. } => {
+                "run it as the directory's owner, or use another directory with --data DIR"
+            }
             StoreError::Directory { .. } | StoreError::Foreign { .. } => "use another directory with --data DIR",
             StoreError::NewerSchema { .. } => "install the newer release, or use another directory with --data DIR",
             StoreError::DiskFull { .. } => "free some disk space, or use another directory with --data DIR",

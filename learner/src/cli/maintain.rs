@@ -87,7 +87,15 @@ pub async fn repair(args: MaintainArgs) -> Result<(), CliError> {
 pub async fn backup(args: BackupArgs) -> Result<(), CliError> {
     let directory = data_directory(args.common.data)?;
     let destination = args.destination;
-    let found = blocking(move || store::backup(&directory, &destination)).await?;
+    let place = destination.clone();
+    let found = blocking(move || Ok(store::backup(&directory, &destination))).await?.map_err(|error| match &error {
+        StoreError::Directory { path, .. } | StoreError::DiskFull { path } | StoreError::Database { path, .. }
+            if path.starts_with(&place) =>
+        {
+            CliError::failure(error.to_string(), "name another directory for the copy")
+        }
+        _ => error.into(),
+    })?;
     if let Some(error) = nothing(&found) {
         return Err(error);
     }

@@ -1,7 +1,7 @@
 //! A copy of a store at one moment, made while services write to it.
 //!
 //! Invariants: the copy is of one moment; it has its name only once it is whole, on stable storage and checked; writers do
-//! not wait for it, and their log is kept until it is done.
+//! not wait for it, and their log is kept until it is done. Nobody may read it who may not read the store.
 
 use super::{StoreError, Verification, check::walk, room::Room, schema};
 use rusqlite::{
@@ -32,6 +32,7 @@ pub fn backup(directory: &Path, destination: &Path) -> Result<Verification, Stor
     if part.exists() {
         fs::remove_file(&part).map_err(fail)?;
     }
+    schema::make_like(&part, &directory.join(schema::FILE_NAME)).map_err(fail)?;
     {
         let sqlite = |e: rusqlite::Error| StoreError::from_sqlite(&part, &e);
         let mut copy = Connection::open(&part).map_err(sqlite)?;

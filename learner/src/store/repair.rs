@@ -2,7 +2,7 @@
 //!
 //! Invariants: the damaged file is never written to; it lies beside the new one when the repair is done, and until then the
 //! old name leads to it. What is taken over was checked as it was read, and the new store is checked as a whole before it
-//! takes the place of the old one.
+//! takes the place of the old one. It is its owner's, and is read by whom the old one was, from the beginning.
 
 use super::{
     StoreError, StoreOptions, Verification, allowance,
@@ -31,7 +31,8 @@ pub struct Repair {
 /// Repairs the store of a directory; a sound one is left alone. Blocks.
 ///
 /// # Errors
-/// Another process has it open; the disk has no room for the new one; nothing of it can be read.
+/// Another process has it open; the disk has no room for the new one; the old one is another user's; nothing of it can be
+/// read.
 pub fn repair(directory: &Path) -> Result<Repair, StoreError> {
     let path = directory.join(schema::FILE_NAME);
     if !path.is_file() {
@@ -46,6 +47,7 @@ pub fn repair(directory: &Path) -> Result<Repair, StoreError> {
     }
     let new_path = directory.join(NEW_FILE);
     remove(&new_path).map_err(fail)?;
+    schema::make_like(&new_path, &path).and_then(|file| schema::hand_over(&file, &path)).map_err(fail)?;
     let found = {
         let new = schema::open_database(&new_path, &StoreOptions::default())?;
         let found = take_over(&old, &path, &new, &new_path)?;

@@ -189,8 +189,8 @@ fn lock_file(directory: &Path, name: &str) -> Result<File, StoreError> {
     file.map_err(|e| StoreError::directory(directory, &e))
 }
 
-/// Makes a directory and its parents where they are missing; their names are on stable storage when this returns. SQLite
-/// sees to the names of its files in the directory, but not to that of the directory.
+/// Makes a directory and its parents where they are missing, for their owner alone; their names are on stable storage when
+/// this returns. SQLite sees to the names of its files in the directory, but not to that of the directory.
 pub fn make_directory(directory: &Path) -> io::Result<()> {
     if directory.is_dir() {
         return Ok(());
@@ -199,7 +199,10 @@ pub fn make_directory(directory: &Path) -> io::Result<()> {
     if let Some(parent) = parent {
         make_directory(parent)?;
     }
-    match fs::create_dir(directory) {
+    let mut builder = fs::DirBuilder::new();
+    #[cfg(unix)]
+    std::os::unix::fs::DirBuilderExt::mode(&mut builder, 0o700);
+    match builder.create(directory) {
         // Somebody else was faster.
         Err(error) if error.kind() == io::ErrorKind::AlreadyExists && directory.is_dir() => {}
         made => made?,
@@ -210,6 +213,40 @@ pub fn make_directory(directory: &Path) -> io::Result<()> {
 /// Puts the names of a directory's files on stable storage, where the platform can.
 pub fn sync_directory(directory: &Path) -> io::Result<()> {
     if cfg!(unix) { File::open(directory)?.sync_all() } else { Ok(()) }
+}
+
+/// An empty file for a database that nobody may read who may not read `like`.
+#[cfg_attr(not(unix), expect(unused_variables, reason = "permissions are inherited from the directory there"))]
+pub fn make_like(path: &Path, like: &Path) -> io::Result<File> {
+    let mut options = File::options();
+    options.write(true).create_new(true);
+    #[cfg(unix)]
+    {
+        use std::os::unix::fs::{MetadataExt as _, OpenOptionsExt as _};
+        options.mode(fs::metadata(like)?.mode() & 0o777 | 0o600);
+    }
+    options.open(path)
+}
+
+/// Gives a file the owner and the permissions of another, so that it can take its place.
+///
+/// # Errors
+/// Its owner is another user's, and only root may give files away.
+#[cfg_attr(not(unix), expect(unused_variables, reason = "permissions are inherited from the directory there"))]
+pub fn hand_over(file: &File, like: &Path) -> io::Result<()> {
+    #[cfg(unix)]
+    {
+        use std::os::unix::fs::{MetadataExt as _, PermissionsExt as _, fchown};
+        let (ours, theirs) = (file.metadata()?, fs::metadata(like)?);
+        if (ours.uid(), ours.gid()) != (theirs.uid(), theirs.gid()) {
+            fchown(file, Some(theirs.uid()), Some(theirs.gid())).map_err(|error| {
+                let message = format!("a new file cannot be given to the owner of {}: {error}", like.display());
+                io::Error::new(error.kind(), message)
+            })?;
+        }
+        file.set_permissions(fs::Permissions::from_mode(theirs.mode() & 0o777 | 0o600))?;
+    }
+    Ok(())
 }
 
 /// A database for writing, made where it is missing and brought up to date.

@@ -166,6 +166,9 @@ async fn a_backup_of_a_service_at_work_opens_and_holds_what_was_acknowledged() {
     assert_eq!(again.status.code(), Some(1));
     let (error, hint) = complaint(&again);
     assert!(error.contains("already") && hint == "name another directory for the copy", "{again:?}");
+    // It is the store that is missing, wherever the copy is to be.
+    let none = learner(&["backup", copies.path().to_str().expect("a path")], &copies.path().join("none"));
+    assert!(complaint(&none).1.contains("--data"), "{none:?}");
 }
 
 #[cfg(unix)]

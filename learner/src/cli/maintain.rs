@@ -88,13 +88,17 @@ pub async fn backup(args: BackupArgs) -> Result<(), CliError> {
     let directory = data_directory(args.common.data)?;
     let destination = args.destination;
     let place = destination.clone();
-    let found = blocking(move || Ok(store::backup(&directory, &destination))).await?.map_err(|error| match &error {
-        StoreError::Directory { path, .. } | StoreError::DiskFull { path } | StoreError::Database { path, .. }
-            if path.starts_with(&place) =>
-        {
+    let found = blocking(move || Ok(store::backup(&directory, &destination))).await?.map_err(|error| {
+        let of_the_copy = match &error {
+            StoreError::Directory { path, .. } => *path == place,
+            StoreError::DiskFull { path } | StoreError::Database { path, .. } => path.parent() == Some(&place),
+            _ => false,
+        };
+        if of_the_copy {
             CliError::failure(error.to_string(), "name another directory for the copy")
+        } else {
+            error.into()
         }
-        _ => error.into(),
     })?;
     if let Some(error) = nothing(&found) {
         return Err(error);
